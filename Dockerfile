@@ -7,7 +7,7 @@ COPY . /workspace/src/umf_ros
 RUN source /opt/ros/jazzy/setup.bash && /workspace/src/umf_ros/tools/install_jazzy.sh /workspace
 RUN printf '%s\n' '#!/bin/bash' 'set -e' 'source /opt/ros/jazzy/setup.bash' 'source /workspace/venv/bin/activate' \
     'source /workspace/install/setup.bash' 'exec "$@"' >/entrypoint.sh && chmod +x /entrypoint.sh
-# ros2 launch ends its nodes at Ctrl-C; at SIGTERM it leaves them, and what they have found, behind
+# ros2 launch ends its nodes at SIGINT; at SIGTERM it leaves them running, and their results unwritten
 STOPSIGNAL SIGINT
 ENTRYPOINT ["/entrypoint.sh"]
 CMD ["ros2", "launch", "umf_ros", "loop_closure.launch.py"]

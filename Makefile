@@ -1,6 +1,6 @@
 # make demo   simulate a traverse, run the real graph over DDS on it, write results/latest
 # make test   the whole test suite
-# make test-jazzy   the suite against what an installed Jazzy has: NumPy 1.26.4, in a venv of its own
+# make test-jazzy   the suite with the versions of an installed Jazzy (NumPy 1.26.4), in a separate venv
 # make check   lint and the fast tests, about two minutes
 # make lint   ruff, mypy, codespell, the import contracts and the rules of prose
 # make docs   the documentation as a site, build/site
@@ -10,11 +10,11 @@ SHELL := /bin/bash
 VENV ?= .venv
 SEED ?= 1
 DEMO ?=
-# where pip finds the CPU builds of torch, if that can be reached: plain "torch" would pull gigabytes of CUDA
+# index of the CPU builds of torch; plain "torch" would install CUDA builds of some gigabytes
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 PYTHON ?= $(shell for p in python3.12 python3.11 python3; do $$p -c 'import sys; sys.exit(not (3,11) <= sys.version_info[:2] <= (3,12))' 2>/dev/null && echo $$p && break; done)
 BIN := $(VENV)/bin
-# files of tests side by side, each worker on one thread
+# test files in parallel, each worker with one thread
 JOBS ?= $(shell cores=$$(getconf _NPROCESSORS_ONLN); echo $$((cores < 4 ? cores : 4)))
 PYTEST := -m pytest -n $(JOBS) --dist loadfile
 
@@ -24,14 +24,14 @@ demo: install
 test: install
 	@OMP_NUM_THREADS=1 $(BIN)/python $(PYTEST)
 
-# without tests that take seconds each, start nodes, a browser or a database server
+# without slow tests and tests that start nodes, a browser or a database server
 check: lint
 	@OMP_NUM_THREADS=1 $(BIN)/python $(PYTEST) -m "not (slow or ros or browser or postgres)"
 
 test-jazzy: .venv-jazzy/.installed
 	@OMP_NUM_THREADS=1 .venv-jazzy/bin/python $(PYTEST)
 
-# all that tests import but the Rerun viewer, which asks for NumPy 2
+# all packages that tests import except the Rerun viewer, which needs NumPy 2
 .venv-jazzy/.installed: $(wildcard requirements*.txt) package.xml setup.py setup.cfg pyproject.toml
 	@test -n "$(PYTHON)" || { echo "make: Python 3.11 or 3.12 is needed (set PYTHON=...)" >&2; exit 1; }
 	@./tools/system_packages.sh
@@ -58,7 +58,7 @@ docs: install
 
 install: $(VENV)/.installed
 
-# requirements first: they change rarely and take the time
+# requirements in a separate step: they change rarely and take most of the time
 $(VENV)/.installed: $(wildcard requirements*.txt) package.xml setup.py setup.cfg pyproject.toml
 	@test -n "$(PYTHON)" || { echo "make: Python 3.11 or 3.12 is needed (set PYTHON=...)" >&2; exit 1; }
 	@./tools/system_packages.sh

@@ -1,6 +1,8 @@
 """Start the loop-closure front-end and the pose-graph back-end; optionally a bag player and RViz.
 
 ros2 launch umf_ros loop_closure.launch.py params_file:=/path/to/params.yaml bag:=/path/to/recording.mcap
+
+Without a parameter file the nodes find their topics by type, and the rig by /tf_static and camera_info.
 """
 
 from pathlib import Path
@@ -18,44 +20,45 @@ from umf_ros.core.errors import ConfigError
 from umf_ros.nodes.start import check_parameter_file, full_name, is_true
 
 ARGUMENTS = [
-    ("params_file", "", "parameter file; empty: the shipped config/loop_closure.yaml"),
-    ("config", "", "the same, by its former name"),
-    ("namespace", "", "namespace of both nodes and of their topics: one for each robot"),
-    ("log_level", "info", "debug, info, warn, error or fatal"),
-    ("use_sim_time", "", "true to follow /clock; empty: true when a bag is played"),
-    ("rviz", "false", "true to open RViz"),
-    ("bag", "", "recording to play"),
+    ("params_file", "", "parameter file; empty: none, topics are found by type"),
+    ("config", "", "former name of params_file"),
+    ("namespace", "", "namespace of the nodes and their topics; one per robot"),
+    ("log_level", "info", "log level of the nodes: debug, info, warn, error or fatal"),
+    ("use_sim_time", "", "true: use /clock; empty: true if bag is set"),
+    ("rviz", "false", "true: open RViz"),
+    ("bag", "", "recording to play; empty: none"),
     ("results_dir", "", "folder for closures, trajectories and the pose graph; empty: none"),
-    ("autostart", "true", "false: the nodes wait for the services of their life cycle"),
+    ("autostart", "true", "true: the nodes configure and activate themselves; false: a life-cycle manager does"),
 ]
 CHOICES = {"log_level": ["debug", "info", "warn", "error", "fatal"]}
 LONGEST_S = "60"
-"""So long the nodes may take to write their results before launch insists."""
+"""Time in s that launch gives the nodes to write their results at shutdown."""
 
 
 NODES = ("loop_closure_node", "pose_graph_node")
 
 
 def start_nodes(context, *_):
-    """Turn the arguments into nodes; what is wrong with them is found before anything is started.
+    """Return the nodes for the arguments, after all arguments are checked.
 
     Raises:
         RuntimeError: an argument is wrong, a file or a package is missing, or a file is for other nodes.
     """
     value = {name: LaunchConfiguration(name).perform(context) for name, *_ in ARGUMENTS}
     share = FindPackageShare("umf_ros").perform(context)
-    config = value["params_file"] or value["config"] or f"{share}/config/loop_closure.yaml"
+    config = value["params_file"] or value["config"]
     try:
         own = _own_parameters(value)
         rviz = is_true("rviz", value["rviz"])
-        check_parameter_file(Path(config), [full_name(value["namespace"], name) for name in NODES])
+        if config:
+            check_parameter_file(Path(config), [full_name(value["namespace"], name) for name in NODES])
     except ConfigError as error:
         raise RuntimeError(str(error)) from None
     if value["bag"] and not Path(value["bag"]).exists():
         raise RuntimeError(f"bag: there is no {value['bag']}")
 
     def node(executable, **options):
-        # its own logger alone: at "debug" those of rcl say hundreds of lines
+        # only the node's own logger: at "debug" those of rcl print hundreds of lines
         logger = full_name(value["namespace"], executable).strip("/").replace("/", ".")
         return Node(
             package="umf_ros",
@@ -70,8 +73,8 @@ def start_nodes(context, *_):
         )
 
     viewer = [_viewer(context, share, value["namespace"])] if rviz else []
-    nodes = [node(name, parameters=[config, own]) for name in NODES]
-    # one alone finds or judges nothing: when one cannot start, the other is not left behind
+    nodes = [node(name, parameters=[*([config] if config else []), own]) for name in NODES]
+    # neither node is useful alone: if one ends, launch ends the other
     ends = [
         RegisterEventHandler(OnProcessExit(target_action=one, on_exit=[EmitEvent(event=Shutdown())])) for one in nodes
     ]
@@ -100,7 +103,7 @@ def _viewer(context, share, namespace):
 
 
 def _end_if_it_failed(event, _):
-    """At the end of a recording the nodes go on; without one they would wait for ever."""
+    """Shut down if the player failed; after a complete recording the nodes continue."""
     return [EmitEvent(event=Shutdown(reason="the recording cannot be played"))] if event.returncode else []
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from umf_ros.core.config import PoseGraphSettings, Settings, dump_settings
 from umf_ros.core.errors import OutputError, UmfError
-from umf_ros.core.frames import LoopClosure
+from umf_ros.core.frames import LoopClosure, State
 from umf_ros.durable_graph import JOURNAL, DurableGraph
 from umf_ros.lab.live.live_graph import settle_left
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
@@ -62,7 +62,7 @@ def test_a_revoked_closure_stays_revoked(world: GraphWorld, tmp_path: Path) -> N
     graph = made(tmp_path / "graph.sqlite")
     drive(graph, world, 0, len(world.truth))
     match, query, _ = next(one for one in states(graph) if one[2] == "accepted")
-    graph.revoke(match, query)
+    graph.decide_by_hand(match, query, State.REJECTED)
     graph.close()
     again = made(tmp_path / "graph.sqlite")
     assert (match, query, "rejected") in states(again) and states(again) == states(graph)
@@ -209,7 +209,7 @@ def test_a_resumed_graph_goes_on_and_keeps_revocations(world: GraphWorld, tmp_pa
     drive(again, world, 270, len(world.truth))
     assert states(again) == states(whole)
     np.testing.assert_allclose(again.graph.trajectory()[1], whole.graph.trajectory()[1], atol=1e-6)
-    again.revoke(*revoked)
+    again.decide_by_hand(*revoked, State.REJECTED)
     again.close()
     last_one = made(path)
     assert (*revoked, "rejected") in states(last_one)
@@ -225,3 +225,18 @@ def test_other_settings_decide_all_again(world: GraphWorld, tmp_path: Path) -> N
     believing = SETTINGS.model_copy(update={"reject_outliers": False})
     again = DurableGraph(believing, tmp_path / JOURNAL, [].append)
     assert again.graph.verdict_counts() != counts and again.changed
+
+
+def test_decisions_by_hand_are_there_again_until_they_are_undone(world: GraphWorld, tmp_path: Path) -> None:
+    graph = made(tmp_path / "graph.sqlite")
+    drive(graph, world, 0, len(world.truth))
+    match, query, before = next(one for one in states(graph) if one[2] != "accepted")
+    graph.decide_by_hand(match, query, State.ACCEPTED)
+    graph.close()
+    again = made(tmp_path / "graph.sqlite")
+    assert (match, query, "accepted") in states(again)
+    again.decide_by_hand(match, query, State.PENDING)
+    again.close()
+    last_one = made(tmp_path / "graph.sqlite")
+    assert (match, query, before) in states(last_one)
+    last_one.close()

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# What a new user gets wrong in the first hour: over 110 wrong inputs, and for each exit status, seconds, seconds of CPU
-# and the line. Ends with 1 when one of them is not one line, not refused, slow where it could be known at once, or a
-# traceback. Slow: more than AT_ONCE_S of CPU, so that a busy machine changes nothing.
+# Run over 110 wrong inputs of a new user; print exit status, seconds, CPU seconds and the line of each. The exit status is 1 if
+# an input is accepted, or gives more than one line, a traceback, or a late answer. Late: more than AT_ONCE_S of CPU time for an
+# error that needs no import of large packages.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
@@ -23,7 +23,7 @@ mkdir "$T/set"; { printf 'P5 4 4 255\n'; head -c 16 /dev/zero; } > "$T/set/0.pgm
 "$UMF" import folder "$T/set" "$T/good.mcap" > /dev/null || exit 2
 
 TIMEFORMAT='%R %U %S'
-# refused NAME ARGUMENTS...: one line (or typer's box), not 0; NAME now: known at once, later: not before much is imported
+# refused NAME ARGUMENTS...: one line (or typer's box), not 0; NAME now: within AT_ONCE_S, later: after large imports
 refused() {
   local name=$1; shift
   local status seconds cpu said lines fault=""
@@ -44,7 +44,7 @@ refused() {
   printf '%-4s %s %5ss %5ss  umf %s: %s%s\n' "$count" "$status" "$seconds" "$cpu" \
     "$(printf '%s ' "$@" | sed "s#$T#.#g")" "$said" "${fault:+   <-- $fault}"
 }
-# took SECONDS ARGUMENTS...: the best of three, of CPU
+# took SECONDS ARGUMENTS...: CPU time, best of three runs
 took() {
   local most=$1 best=99 one; shift
   for _ in 1 2 3; do
@@ -103,7 +103,7 @@ refused later compare "$T/nowhere.pcd" "$T/wrong.pcd"
 refused later compare "$T/wrong.pcd" "$T/wrong.pcd"
 refused later compare --list "$T/pairs.csv" --out "$T/out.csv"
 
-# several recordings in one map, and a rover in it
+# maps and localisation
 refused now map
 refused now map "$T/nowhere.mcap" --out "$T/map"
 refused now map "$T/good.mcap" --workers 0
@@ -118,7 +118,7 @@ refused later replay "$T/good.mcap" --mode sideways
 refused later replay "$T/good.mcap" --map "$T/folder" --rerun "$T/run.rrd"
 refused later replay "$T/good.mcap" --rerun "$T/nowhere/run.rrd"
 refused later replay "$T/good.mcap" --out "$T/notes.txt"
-# a fleet, and a store of places
+# fleet and place database
 refused later fleet setup "nonsense"
 refused later fleet setup "postgresql://me:secret@127.0.0.1:9/places"
 refused later fleet setup "postgresql://me@127.0.0.1:9/places"
@@ -132,7 +132,7 @@ refused now places delete "$T/nowhere.sqlite"
 refused now bench nonsense
 refused now bench places --run "$T/nowhere"
 refused later bench places --run "$T/folder"
-# data sets, training and adapting
+# data sets and training
 refused now import nuscenes "$T/nowhere" "$T/a.mcap"
 refused later import nuscenes "$T/folder" "$T/a.mcap"
 refused now adapt "$T/good.mcap"
@@ -147,7 +147,7 @@ refused later pretrain image "$T/nowhere"
 refused now pretrain sound "$T/folder"
 refused later export "$T/notes.txt/model.xml"
 refused later export "$T/model.xml" --weights "$T/notes.txt"
-# evaluating
+# evaluation
 printf 'sets: 3\n' > "$T/places.yaml"; printf 'places:\n  - name: a\n    queries: nowhere\n' > "$T/more.yaml"
 refused now evaluate
 refused now evaluate "$T/nowhere.yaml"
@@ -158,7 +158,7 @@ refused now evaluate --worlds test --count 9
 refused now evaluate --worlds test --methods some
 refused now evaluate "$T/good.mcap" --worlds test
 refused later evaluate "$T/good.mcap"
-# and the rest
+# other commands
 refused later why "$T/run" soon
 refused later compare --list "$T/nowhere.csv" --out "$T/out.csv"
 refused now compare --list "$T/pairs.csv"

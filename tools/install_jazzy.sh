@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Install umf_ros beside an installed ROS 2 Jazzy on Ubuntu 24.04 (x86-64 or aarch64) and look whether it works:
+# Install umf_ros beside an installed ROS 2 Jazzy on Ubuntu 24.04 (x86-64 or aarch64) and check it:
 #
 #   source /opt/ros/jazzy/setup.bash
 #   src/umf_ros/tools/install_jazzy.sh [WORKSPACE]
 #
 # WORKSPACE is the colcon workspace that holds src/umf_ros (default: two folders above this repository). Python
-# packages go to WORKSPACE/venv, which sees the system's packages and changes none of them.
+# packages go to WORKSPACE/venv, which uses the system's packages and does not change them.
 set -euo pipefail
 repository=$(cd "$(dirname "$0")/.." && pwd)
 workspace=$(cd "${1:-$repository/../..}" && pwd)
@@ -45,7 +45,7 @@ echo "Installing the Python packages into $venv (some minutes the first time)"
 cd "$workspace"
 # shellcheck disable=SC1091
 source "$venv/bin/activate"
-# the executables take the Python that is first in the path: that of the venv
+# the executables use the first Python on the PATH: that of the venv
 colcon build --packages-select umf_ros
 set +u
 # shellcheck disable=SC1091

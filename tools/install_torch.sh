@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Install the CPU build of the torch that is pinned, from where such builds are; without that, say so and leave it to the
-# requirements, whose plain torch may be a CUDA build of some gigabytes.
+# Install the CPU build of the pinned torch from its own index. If that index has none, print a line and leave torch to the
+# requirements; that build may be a CUDA build of some gigabytes.
 #
 #   tools/install_torch.sh PYTHON [INDEX]
 set -euo pipefail
@@ -13,8 +13,8 @@ if "$python" -c 'import sys, importlib.metadata as m; sys.exit(m.version("torch"
   "${pinned#torch==}" 2>/dev/null; then
   exit 0
 fi
-# what torch itself needs is not all there: the usual index has that
+# --no-deps: the CPU index lacks some requirements of torch; the usual index has them
 if ! "$python" -m pip install --quiet --disable-pip-version-check --retries 1 --timeout 15 --no-deps \
   --index-url "$index" "$pinned" 2>/dev/null; then
-  echo "No CPU build of $pinned from $index (set TORCH_INDEX): the usual index decides, whose build may be one of 5 GB" >&2
+  echo "No CPU build of $pinned from $index (set TORCH_INDEX): torch comes from the usual index, possibly a build of 5 GB" >&2
 fi

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Pictures of a report in a real browser, as wide as a screen and as a telephone, light and dark.
+# Screenshots of a report in Chromium: desktop and telephone width, light and dark.
 #   tools/report_screens.sh results/latest/report.html results/screens
 set -euo pipefail
 report=$(readlink -f "$1"); out=${2:-results/screens}; height=${3:-3600}
@@ -11,7 +11,7 @@ shoot() { # page width name scheme (0 dark, 1 light)
     --screenshot="$out/$3.png" "file://$1" > "$work/log" 2>&1
   echo "$out/$3.png"
 }
-# a browser's own window cannot be as narrow as a telephone: a frame can
+# Chromium's window has a minimum width above a telephone's; a frame has none
 printf '<body style="margin:0"><iframe style="border:0" width=390 height=%s src="file://%s"></iframe>' "$height" "$report" > "$work/narrow.html"
 shoot "$report" 1280 wide_light 1; shoot "$report" 1280 wide_dark 0
 shoot "$work/narrow.html" 500 narrow_light 1; shoot "$work/narrow.html" 500 narrow_dark 0

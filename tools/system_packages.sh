@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Install the system libraries that the lab's wheels need but do not bring along: open3d loads libusb-1.0 and libGL.
-# A rover, which does without open3d, needs none of them. With --browser also Chromium, which tests look at the report with.
+# Install the system libraries that the lab's wheels need but do not contain: open3d loads libusb-1.0 and libGL. A rover
+# needs none of them. With --browser also Chromium, in which tests open the report.
 set -eu
 missing=()
 known=$(ldconfig -p 2>/dev/null || /sbin/ldconfig -p)

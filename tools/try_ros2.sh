@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Try every verb of the `ros2` command on the nodes, in two namespaces at once, and print a table "tried | expected | got".
+# Run every verb of the `ros2` command on nodes in two namespaces; print a table "tried | expected | got".
 #
 #   source install/setup.bash && src/umf_ros/tools/try_ros2.sh [--write docs/ros.md]
 #
@@ -26,9 +26,10 @@ row() { # command, what is expected (an extended regular expression), what that 
 }
 
 launch() { # namespace: both nodes, until they are ready
-  # what is started in the background ignores Ctrl-C, and hands that on
+  # background processes ignore SIGINT by default, and so do their children
+  # --dataset: no topics exist yet that could be found by type
   env --default-signal=INT,TERM ros2 launch umf_ros loop_closure.launch.py namespace:="$1" results_dir:="$folder/run_$1" \
-    >"$folder/$1.log" 2>&1 &
+    params_file:="$(ros2 pkg prefix --share umf_ros)/config/loop_closure.yaml" >"$folder/$1.log" 2>&1 &
   launched+=($!)
   for _ in $(seq 120); do [ "$(grep -c ': ready' "$folder/$1.log")" -ge 2 ] && return; sleep 0.5; done
 }
@@ -45,29 +46,29 @@ stop() { # Ctrl-C for all that was launched
 printf '| tried | expected | got |\n|---|---|---|\n' >"$table"
 printf 'camera_driver:\n  ros__parameters: {rate: 30}\n' >"$folder/other.yaml"
 start='ros2 launch umf_ros loop_closure.launch.py'
-row 'ros2 pkg executables umf_ros' 'loop_closure_node' 'both nodes are there'
-row 'umf --version' 'umf_ros [0-9]' 'the command is in the path'
+row 'ros2 pkg executables umf_ros' 'loop_closure_node' 'both nodes are listed'
+row 'umf --version' 'umf_ros [0-9]' 'the command is on the PATH'
 row "$start --show-args" 'params_file' 'every argument is described'
 row "$start params_file:=/no.yaml" 'there is no /no.yaml' 'stops with one line'
-row "$start params_file:=$folder/other.yaml" 'sets nothing for /loop_closure_node' 'a file for other nodes starts nothing'
-row "$start namespace:=one params_file:=$folder" 'there is no' 'nor does a folder'
+row "$start params_file:=$folder/other.yaml" 'sets nothing for /loop_closure_node' 'a file for other nodes: stops with one line'
+row "$start namespace:=one params_file:=$folder" 'there is no' 'a folder: stops with one line'
 row "$start log_level:=loud" 'Valid options are' 'stops with one line'
 row "$start use_sim_time:=perhaps" 'true or false' 'stops with one line'
 row "$start bag:=/no.mcap" 'there is no /no.mcap' 'stops with one line'
-row "$start bag:=$folder/other.yaml" 'pose_graph_node-2\]: process has finished cleanly' 'the nodes do not wait for what is no recording'
+row "$start bag:=$folder/other.yaml" 'pose_graph_node-2\]: process has finished cleanly' 'not a recording: the nodes end'
 row 'ros2 run umf_ros loop_closure_node --ros-args -p lop:=1' '^umf: unknown parameter lop$' 'stops with one line'
-row 'ros2 run umf_ros pose_graph_node --ros-args -p pose_graph.gate_chi2:=-1.0' '^umf: pose_graph.gate_chi2' 'so does a value out of range'
+row 'ros2 run umf_ros pose_graph_node --ros-args -p pose_graph.gate_chi2:=-1.0' '^umf: pose_graph.gate_chi2' 'value out of range: stops with one line'
 # shellcheck disable=SC2016
 row 'timeout --preserve-status -s INT 1 $(ros2 pkg prefix umf_ros)/lib/umf_ros/loop_closure_node; echo status $?' \
-  '^status 0$' 'Ctrl-C while it loads'
+  '^status 0$' 'Ctrl-C while loading: status 0'
 
 launch one
 launch two
 ros2 daemon start >/dev/null 2>&1  # the first question to a fresh one finds an empty graph
 sleep 5
 front=/one/loop_closure_node back=/one/pose_graph_node
-row 'ros2 node list' "$front" 'the nodes in their namespaces'
-row "ros2 node info $front" '/one/loop_closures: nav_msgs/msg/Odometry' 'topics are relative to the namespace'
+row 'ros2 node list' "$front" 'nodes are in their namespaces'
+row "ros2 node info $front" '/one/loop_closures: nav_msgs/msg/Odometry' 'topics are in the namespace'
 row 'ros2 topic list -t' '/two/loop_closures \[nav_msgs/msg/Odometry\]' 'stock message types only'
 row 'ros2 topic info -v /one/loop_closures' 'Durability: TRANSIENT_LOCAL' 'latched, with history'
 zeros='0, 0, 0, 0, 0, 0'
@@ -75,43 +76,43 @@ closure="{header: {stamp: {sec: 9}, frame_id: keyframe/1000000000}, child_frame_
   pose: {covariance: [1, $zeros, 1, $zeros, 1, $zeros, 1, $zeros, 1, $zeros, 1]}}"
 printf '%s\n' "$closure" >"$folder/closure.yaml"
 row "ros2 topic pub --once --qos-durability transient_local /one/loop_closures nav_msgs/msg/Odometry \"\$(cat $folder/closure.yaml)\"" \
-  'publishing' 'a closure of one robot'
+  'publishing' 'a closure of robot one is published'
 health="ros2 topic echo --once /diagnostics --filter"
 row "$health 'm.status[0].name == \"one/pose_graph_node: pose graph\" and \"1 closures wait\" in m.status[0].message'" \
-  'hardware_id: one' 'is heard by its own back-end'
-row "$health 'm.status[0].name == \"two/pose_graph_node: pose graph\"'" 'message: .?0 closures accepted' 'and by no other'
+  'hardware_id: one' 'the back-end of robot one receives it'
+row "$health 'm.status[0].name == \"two/pose_graph_node: pose graph\"'" 'message: .?0 closures accepted' 'the back-end of robot two does not'
 row "timeout 8 ros2 topic pub --once /one/loop_closures nav_msgs/msg/Odometry; cat $folder/one.log" \
-  'incompatible QoS' 'a publisher without history is told apart'
+  'incompatible QoS' 'a publisher without history: QoS warning'
 row 'ros2 topic hz /diagnostics --window 5 & sleep 8; kill $!' 'average rate' 'about once per second and node'
 row "ros2 param list $back" 'pose_graph.gate_chi2' 'every setting is a parameter'
-row "ros2 param describe $front loop.top_k" 'Max value: 200' 'with its range'
-row "ros2 param get $front verification.min_probability" '0\.9' 'and its value'
-row "ros2 param set $front verification.min_probability 0.95" 'successful' 'what may change does'
-row "ros2 param set $front loop.top_k 0" 'failed|range' 'within its range'
-row "ros2 param set $front loop.top_k many" '[Ww]rong parameter type' 'of its type'
-row "ros2 param set $front embedding.threads 2" 'read-only' 'and nothing else'
+row "ros2 param describe $front loop.top_k" 'Max value: 200' 'the range is printed'
+row "ros2 param get $front verification.min_probability" '0\.9' 'the value is printed'
+row "ros2 param set $front verification.min_probability 0.95" 'successful' 'a run-time parameter changes'
+row "ros2 param set $front loop.top_k 0" 'failed|range' 'a value out of range is refused'
+row "ros2 param set $front loop.top_k many" '[Ww]rong parameter type' 'a value of another type is refused'
+row "ros2 param set $front embedding.threads 2" 'read-only' 'a read-only parameter is refused'
 row "ros2 param dump $front" 'min_probability: 0.95' 'a file to start from'
-row "ros2 service list" "$front/save" 'services of the nodes'
-row "ros2 service call $front/pause std_srvs/srv/SetBool '{data: true}'" "message='paused'" 'paused'
-row "ros2 service call $front/reset std_srvs/srv/Trigger" 'all places are kept' 'ends the session, deletes nothing'
+row "ros2 service list" "$front/save" 'services are listed'
+row "ros2 service call $front/pause std_srvs/srv/SetBool '{data: true}'" "message='paused'" 'the front-end pauses'
+row "ros2 service call $front/reset std_srvs/srv/Trigger" 'all places are kept' 'the session ends, all places are kept'
 row "ros2 service call $back/save std_srvs/srv/Trigger" 'results written' 'trajectory and graph on disk'
-row "ros2 topic pub --once $back/reject_edge std_msgs/msg/String '{data: nonsense}'" 'publishing' 'is survived, and counted'
-row 'ros2 lifecycle nodes' "$back" 'managed nodes'
-row "ros2 lifecycle get $front" 'active' 'active from the start'
-row "ros2 lifecycle set $front configure" 'Unknown transition' 'only what leads on from there'
-row "ros2 lifecycle set $front deactivate" 'Transitioning successful' 'stops taking messages'
-row "ros2 lifecycle set $front activate" 'Transitioning successful' 'takes them again'
+row "ros2 topic pub --once $back/reject_edge std_msgs/msg/String '{data: nonsense}'" 'publishing' 'a malformed message is published; later rows still pass'
+row 'ros2 lifecycle nodes' "$back" 'managed nodes are listed'
+row "ros2 lifecycle get $front" 'active' 'active after the start'
+row "ros2 lifecycle set $front configure" 'Unknown transition' 'an invalid transition is refused'
+row "ros2 lifecycle set $front deactivate" 'Transitioning successful' 'the transition succeeds'
+row "ros2 lifecycle set $front activate" 'Transitioning successful' 'the transition succeeds'
 row "for to in deactivate cleanup configure activate; do ros2 lifecycle set $back \$to; done; ros2 node info $back" \
-  "$back/path: nav_msgs/msg/Path" 'made anew'
-row "ros2 topic info $back/path" 'Publisher count: 1' 'and there once'
-row "ros2 param set $back use_sim_time true; sleep 12; cat $folder/one.log" 'nothing comes on /clock' 'no clock: it says so'
-row 'ros2 interface show nav_msgs/msg/Odometry' 'child_frame_id' 'any SLAM system has it'
+  "$back/path: nav_msgs/msg/Path" 'publishers are created again'
+row "ros2 topic info $back/path" 'Publisher count: 1' 'one publisher only'
+row "ros2 param set $back use_sim_time true; sleep 12; cat $folder/one.log" 'nothing comes on /clock' 'no /clock: a warning is logged'
+row 'ros2 interface show nav_msgs/msg/Odometry' 'child_frame_id' 'a standard message type'
 stop
 for one in one two; do
   row "cat $folder/$one.log" 'loop_closure_node-1\]: process has finished cleanly' 'Ctrl-C: the front-end ends cleanly'
   row "cat $folder/$one.log" 'pose_graph_node-2\]: process has finished cleanly' 'Ctrl-C: the back-end ends cleanly'
 done
-row "ls $folder/run_one" 'graph.g2o' 'and its results are written'
+row "ls $folder/run_one" 'graph.g2o' 'results are written'
 sed -i "s|$folder|FOLDER|g" "$table"
 
 if [ "${1:-}" = --write ]; then

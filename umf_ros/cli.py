@@ -22,7 +22,7 @@ COMMANDS = {
     "import": "umf_ros.lab.commands.import_data",
     "inspect": "umf_ros.lab.commands.inspect",
     "replay": "umf_ros.commands.replay",
-    "map": "umf_ros.commands.map",
+    "map": "umf_ros.commands.map:app",
     "compare": "umf_ros.lab.commands.compare",
     "sensors": "umf_ros.lab.commands.sensors",
     "play": "umf_ros.lab.commands.demo:play",

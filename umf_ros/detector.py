@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import time
@@ -134,7 +135,7 @@ class LoopDetector:
     """Loop detector on a stream of frames; the same in the live node, the replay and the evaluation.
 
     `process` takes a frame through all stages: `select`, `embed`, `query`, `verify`, `match_submaps`, `remember`.
-    The last one is skipped when localising in a fixed map.
+    While localising in a map, the last one keeps places for a later session of the map, or none.
 
     Args:
         settings: all settings.
@@ -142,7 +143,8 @@ class LoopDetector:
 
     Attributes:
         database: the rover's places.
-        inter_robot: closures with other rovers of a fleet; None without a fleet.
+        seen: its places while it localises in a map that grows, in sessions of their own; None: they are not kept.
+        inter_robot: closures with other rovers of a fleet; None of a rover on its own.
         embed_ms: milliseconds that the last embedding took, prefetched or not.
 
     Raises:
@@ -157,7 +159,10 @@ class LoopDetector:
         self._verifier = Verifier(settings.verification)
         self.database = _open_places(settings, embedder)
         self.inter_robot = _connect_fleet(settings, self.database, embedder)
-        self._map = range(self.database.next_session) if settings.localizing else None
+        self._map = _sessions_of(Path(settings.map), self.database) if settings.localizing else None
+        self.seen: PlaceDatabase | None = None
+        if settings.grows_map:
+            self.seen = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
         self._session: int | None = None
         self._stored_session = self.database.next_session
@@ -195,13 +200,10 @@ class LoopDetector:
         fault = None
         with _timed(latency, "submaps"):
             verdicts = self.match_submaps(keyframe, verdicts)
-        if self._map is None:
-            try:
-                self.remember(keyframe, known is not None)
-            except OutputError as error:
-                fault = error
-        else:
-            self._submaps.remember(keyframe)
+        try:
+            self.remember(keyframe, known is not None)
+        except OutputError as error:
+            fault = error
         return Detection(frame.stamp_ns, keyframe, verdicts, latency | {"total": sum(latency.values())}, fault)
 
     def prefetch(
@@ -280,7 +282,10 @@ class LoopDetector:
         Raises:
             OutputError: the disk is full.
         """
-        if not stored:
+        if self._map is not None:
+            if self.seen is not None:
+                self.seen.add(replace(keyframe, session=keyframe.session - self._map.stop))
+        elif not stored:
             row = self.database.add(keyframe)
             if self.inter_robot is not None:
                 self.inter_robot.link.enqueue(row)
@@ -309,6 +314,8 @@ class LoopDetector:
         if self.inter_robot is not None:
             self.inter_robot.close()
         self.database.close()
+        if self.seen is not None:
+            self.seen.close()
 
     def end_session(self) -> None:
         """End the session: the next frame begins a new one; all places are kept."""
@@ -325,6 +332,8 @@ class LoopDetector:
         """Begin a session; if the clock was set back, keyframes with later stamps are not searched until then."""
         self._session = frame.session
         self._stored_session, self._ahead_m = self.database.next_session, 0.0
+        if self.seen is not None:
+            self._stored_session += self.seen.next_session
         if len(self.database) and self._map is None:
             logger.warning("a new session begins; the %d places known so far are kept", len(self.database))
         self._verifier.reset()
@@ -372,6 +381,15 @@ def _assemble(frame: Frame, embedding: Embedding, path_length_m: float, session:
         body_T_lidar=frame.body_T_lidar,
         motion=motion,
     )
+
+
+def _sessions_of(map_folder: Path, places: PlaceDatabase) -> range:
+    """Sessions that a map lists: places of later ones are of an addition that was cut off."""
+    path = map_folder / "map.json"
+    if not path.is_file():
+        return range(places.next_session)
+    sessions = json.loads(path.read_text(encoding="utf-8"))["sessions"]
+    return range(max((one["first_number"] + one["numbers"] for one in sessions), default=0))
 
 
 def _connect_fleet(settings: Settings, database: PlaceDatabase, embedder: Embedder) -> InterRobotMatcher | None:

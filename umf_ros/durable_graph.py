@@ -28,10 +28,12 @@ _TABLES = (
     "residual_m REAL, PRIMARY KEY (match_ns, query_ns))",
 )
 _SCHEMA = Schema("pose graph", (_TABLES,), lambda tables: int({"event", "verdict"} <= tables))
-ODOMETRY, CLOSURE, REVOKED, STARTED, UNSETTLED = "odometry", "closure", "revoked", "started", "unsettled"
+ODOMETRY, CLOSURE, STARTED, UNSETTLED = "odometry", "closure", "started", "unsettled"
+BY_HAND = {"revoked": State.REJECTED, "accepted": State.ACCEPTED, "undone": State.PENDING}
+"""Decisions by hand, as they are logged."""
 _ABSOLUTE = (Aid.GNSS.value, Aid.GRAVITY.value)
 # "decided" is of earlier versions
-_NUMBERS = {ODOMETRY: 16, CLOSURE: 53, REVOKED: 0, STARTED: 0, UNSETTLED: 0, "decided": 0}
+_NUMBERS = {ODOMETRY: 16, CLOSURE: 53, STARTED: 0, UNSETTLED: 0, "decided": 0, **dict.fromkeys(BY_HAND, 0)}
 _NUMBERS |= dict.fromkeys(_ABSOLUTE, 15)
 _EVENT = "INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)"
 _EVENTS = "SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"
@@ -126,14 +128,14 @@ class DurableGraph:
         self._log(CLOSURE, closure.match_stamp_ns, closure.query_stamp_ns, numbers)
         return self._logged(self.graph.add_closure(closure))
 
-    def revoke(self, match_ns: int, query_ns: int) -> list[ClosureVerdict]:
-        """Revoke every closure between two keyframes for good.
+    def decide_by_hand(self, match_ns: int, query_ns: int, state: State) -> list[ClosureVerdict]:
+        """Accept or reject every closure between two keyframes whatever the evidence; pending takes that back.
 
         Raises:
-            GraphError: there is no such closure, or the graph cannot be solved without it.
+            GraphError: there is no such closure, or the graph cannot be solved so; then nothing has changed.
         """
-        verdicts = self.graph.revoke(match_ns, query_ns)
-        self._log(REVOKED, match_ns, query_ns)
+        verdicts = self.graph.decide_by_hand(match_ns, query_ns, state)
+        self._log(next(kind for kind, meant in BY_HAND.items() if meant is state), match_ns, query_ns)
         return self._logged(verdicts)
 
     def update(self) -> list[ClosureVerdict]:
@@ -193,15 +195,16 @@ class DurableGraph:
             verdicts = {(match, query): _decision(*columns) for match, query, *columns in known}
             mark = connection.execute("PRAGMA user_version").fetchone()[0]
             last = connection.execute("SELECT kind FROM event ORDER BY id DESC LIMIT 1").fetchone()
-            revoked: list[tuple[int, int]] = []
-            feed(self.graph, self._inputs(connection.execute(_EVENTS), revoked), self.feed)
+            decided: dict[tuple[int, int], State] = {}
+            feed(self.graph, self._inputs(connection.execute(_EVENTS), decided), self.feed)
         self.unsettled = last is not None and last[0] == UNSETTLED
         self.graph.resume(verdicts if mark == self._mark else {})
-        for pair in revoked:
+        for pair, state in decided.items():
             try:
-                self.graph.revoke(*pair)
+                if state is not State.PENDING:
+                    self.graph.decide_by_hand(*pair, state)
             except GraphError:
-                self.graph.counts["revoked closure not found"] += 1
+                self.graph.counts["closure decided by hand not found"] += 1
         if last is not None:
             self.feed.interrupted()
             self._log(STARTED)
@@ -211,8 +214,8 @@ class DurableGraph:
         states = {(v.closure.match_stamp_ns, v.closure.query_stamp_ns): v.state for v in found}
         self.changed = sum(states.get(pair) != state for pair, (state, *_) in verdicts.items())
 
-    def _inputs(self, events: Iterable[tuple[Any, ...]], revoked: list[tuple[int, int]]) -> Iterator[GraphInput]:
-        """Yield the inputs of logged events; append pairs of keyframes whose closures were revoked."""
+    def _inputs(self, events: Iterable[tuple[Any, ...]], decided: dict[tuple[int, int], State]) -> Iterator[GraphInput]:
+        """Inputs of logged events; adds decisions by hand about closures, by pairs of keyframes."""
         for kind, first_ns, second_ns, data in events:
             numbers = np.frombuffer(data, np.float64)
             if len(numbers) != _NUMBERS.get(kind, -1):
@@ -226,8 +229,8 @@ class DurableGraph:
                 yield LoopClosure(second_ns, first_ns, pose, covariance, float(numbers[52]))
             elif kind in _ABSOLUTE:
                 yield AbsoluteMeasurement.stored(kind, first_ns, numbers)
-            elif kind == REVOKED:
-                revoked.append((first_ns, second_ns))
+            elif kind in BY_HAND:
+                decided[first_ns, second_ns] = BY_HAND[kind]
             elif kind == STARTED:
                 self.feed.interrupted()
 

@@ -318,9 +318,9 @@ class MapFollower(PoseGraph):
         """Return the number of closures by state."""
         return Counter(self._states)
 
-    def revoke(self, match_stamp_ns: int, query_stamp_ns: int) -> list[ClosureVerdict]:
-        """Raise a `GraphError`: closures are not kept."""
-        raise GraphError("localisation in a fixed map keeps no closures to reject")
+    def decide_by_hand(self, match_stamp_ns: int, query_stamp_ns: int, state: State) -> list[ClosureVerdict]:
+        """Raise a `GraphError`: there is nothing to decide about."""
+        raise GraphError("localisation in a fixed map keeps no closures to decide about")
 
     def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
         """Write the trajectory, `trajectory_in_map.tum`; return true, as there is nothing to settle."""

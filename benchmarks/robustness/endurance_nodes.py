@@ -59,6 +59,7 @@ class NodeUnderTest:
         folder.mkdir(parents=True, exist_ok=True)
         self.log = folder / f"{name}.log"
         values = {"results_dir": folder, "qos.reliability": "reliable", "qos.depth": 500, **parameters}
+        values = values if config else {"dataset": "simulated", **values}
         words = ["--params-file", str(config)] if config else []
         words += [word for key, value in values.items() for word in ("-p", f"{key}:={value}")]
         words += ["-r", f"__ns:=/{namespace}"] if namespace else []

@@ -39,7 +39,8 @@ def main(
         bag = Path(folder) / "drive.mcap"
         subprocess.run([*UMF, "simulate", str(bag), "--seed", str(seed), "--duration", "4"], check=True)
         commands = {"replay": [*UMF, "replay", str(bag), "--out", folder]}
-        commands |= {name: [sys.executable, "-m", f"umf_ros.nodes.{name}"] for name in NODES}
+        named = ["--ros-args", "-p", "dataset:=simulated"]  # else they wait for topics
+        commands |= {name: [sys.executable, "-m", f"umf_ros.nodes.{name}", *named] for name in NODES}
         for name, command in commands.items():
             ends = Counter(start(command, name != "replay") for _ in range(starts))
             figures |= {f"{name}_{end}": ends[end] for end in ("fine", "hangs", "failures")}

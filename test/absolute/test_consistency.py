@@ -6,8 +6,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.absolute.consistency import body_offset, find_heading, longest_chain, position_drift, supported, turned
+from umf_ros.absolute.consistency import (
+    MOST_HELD,
+    STRETCH_M,
+    MeasuredPath,
+    Track,
+    body_offset,
+    find_heading,
+    longest_chain,
+    position_drift,
+    supported,
+    turned,
+)
+from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.frames import State
 from umf_ros.core.odometry_noise import OdometryNoise
 
 DRIFT = position_drift(OdometryNoise.stated(PoseGraphSettings()), np.arange(2000.0))
@@ -75,3 +88,64 @@ def test_an_error_that_turns_with_the_body_is_told_from_drift(true: list[float])
     assert np.allclose(offset[:2], true[:2], atol=0.3) and (sigma < 0.5).all()
     straight = np.tile(np.eye(3), (100, 1, 1))
     assert np.sqrt(body_offset(values, variances, straight, path_m, DRIFT)[1][0, 0]) > 100
+
+
+def measured_path(count: int, at_last: bool = False) -> tuple[list[AbsoluteMeasurement], np.ndarray, MeasuredPath]:
+    """Fixes 2 m apart on a winding path, every seventh hundred metres shifted by a reflection; all of it, cut off."""
+    rng, along = np.random.default_rng(0), 2.0 * np.arange(2500)
+    turn = 0.6 * np.sin(along / 40)
+    poses = np.tile(np.eye(4), (len(along), 1, 1))
+    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = (
+        np.cos(turn),
+        -np.sin(turn),
+        np.sin(turn),
+        np.cos(turn),
+    )
+    poses[:, :2, 3] = np.cumsum(2.0 * poses[:, :2, 0], axis=0)
+    lies = along // 100 % 7 == 3
+    values = poses[:, :3, 3] + 0.3 * rng.normal(size=(len(along), 3)) + np.outer(lies, [12.0, -9.0, 0.0])
+    fixes = [
+        AbsoluteMeasurement(Aid.GNSS, 10**9 * k, value, 0.09 * np.eye(3), np.zeros(3)) for k, value in enumerate(values)
+    ]
+    finished = int(along[count - 1] // STRETCH_M) + at_last
+
+    def at_middle(cell: int) -> tuple[int, np.ndarray]:
+        row = min(int((cell + 0.5) * STRETCH_M / 2), len(along) - 1)
+        return 10**9 * row, poses[row]
+
+    return fixes[:count], lies[:count], MeasuredPath(poses[:count], poses[:count], along[:count], finished, at_middle)
+
+
+def test_what_is_decided_on_the_way_is_what_is_decided_at_once() -> None:
+    on_the_way = Track(Aid.GNSS, OdometryNoise.stated(PoseGraphSettings()))
+    known, whole = 0, 0
+    for count in range(25, 2501, 25):
+        fixes, _, path = measured_path(count)
+        on_the_way.add(fixes[known:])
+        known = count
+        before = on_the_way._judged_whole
+        on_the_way.judge(on_the_way.values, path, in_world=True)
+        whole += on_the_way._judged_whole != before
+    fixes, lies, path = measured_path(2500)
+    at_once = Track(Aid.GNSS, OdometryNoise.stated(PoseGraphSettings()))
+    at_once.add(fixes)
+    at_once.judge(at_once.values, path, in_world=True)
+    states = [np.array([one.state is State.ACCEPTED for one in track.verdicts()]) for track in (on_the_way, at_once)]
+    assert not states[0][lies].any() and states[0][~lies].mean() > 0.9
+    assert (states[0] == states[1]).all() and on_the_way.factors.keys() == at_once.factors.keys()
+    assert whole < 60  # of 100: the others looked at the end of the path alone
+    # a long path is held at evenly spread stretches
+    assert len(at_once.factors) > MOST_HELD >= len(at_once.held) > MOST_HELD / 3
+
+
+def test_a_late_measurement_has_all_decided_again() -> None:
+    track = Track(Aid.GNSS, OdometryNoise.stated(PoseGraphSettings()))
+    fixes, lies, path = measured_path(1500)
+    track.add(fixes[:700] + fixes[710:])
+    rows = np.r_[:700, 710:1500]
+    short = MeasuredPath(path.odometry[rows], path.poses[rows], path.travel[rows], path.finished, path.at_middle)
+    track.judge(track.values, short, in_world=True)
+    track.add(fixes[700:710])
+    track.judge(track.values, path, in_world=True)
+    accepted = np.array([one.state is State.ACCEPTED for one in track.verdicts()])
+    assert len(accepted) == 1500 and accepted[700:710][~lies[700:710]].all() and not accepted[lies].any()

@@ -207,7 +207,7 @@ def test_a_recording_is_read_as_the_file_says_and_only_then_by_its_topics(tmp_pa
     assert settings_for(bag, config, "auto").dataset == "s3li-etna"
     assert settings_for(bag, config, "s3li-vulcano", loop__top_k=3).dataset == "s3li-vulcano"
     assert settings_for(bag, config, "auto", loop__top_k=3).loop.top_k == 3
-    config.write_text("topics: {left_image: /my/image, cloud: /my/points}\n")
+    config.write_text("calibration: mine.yaml\ntopics: {left_image: /my/image, cloud: /my/points}\n")
     assert settings_for(strange, config, "auto").topics.cloud == "/my/points"
     with pytest.raises(BagError, match="no topic of a known data set"):
         settings_for(strange, None, "auto")

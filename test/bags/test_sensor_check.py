@@ -48,7 +48,7 @@ def test_sensors_as_they_are_agree(drive: Drive) -> None:
     assert seen.lidar is not None and seen.camera is not None and seen.forward is not None
     for one in (seen.lidar, seen.camera):
         assert abs(one.lag_s) < 0.1 and one.mounting_deg is not None and np.linalg.norm(one.mounting_deg) < 5
-    assert seen.stereo_scale == pytest.approx(1, abs=0.05)
+    assert seen.overlay is not None and seen.overlay.scale == pytest.approx(1, abs=0.006)
     assert seen.forward[0] > 0.9 and seen.left_contrast > 10 and seen.returns > 1000
 
 
@@ -73,10 +73,13 @@ def test_a_baseline_that_is_too_long_and_an_empty_image_are_found(drive: Drive) 
     def spoil(frame: Frame) -> Frame:
         return replace(frame, camera=replace(frame.camera, baseline=1.4 * frame.camera.baseline), points=frame.points)
 
-    few = drive[0][:32]
-    assert checked((few, drive[1]), spoil).stereo_scale == pytest.approx(1.4, abs=0.05)
-    blank = checked((few, drive[1]), lambda one: replace(one, right=np.full((512, 688), 9, np.uint8)))
-    assert blank.right_contrast == 0 and np.isnan(blank.stereo_scale)
+    looks = SensorCheck(), SensorCheck()
+    for frame in drive[0]:
+        looks[0].compare_depths(spoil(frame))
+        looks[1].take(replace(frame, points=None, right=np.full((512, 688), 9, np.uint8)))
+    wide, blank = (look.report(None) for look in looks)
+    assert wide.overlay is not None and wide.overlay.scale == pytest.approx(1.4, abs=0.02)
+    assert blank.right_contrast == 0 and blank.overlay is None
 
 
 def bumpy(seconds: np.ndarray) -> np.ndarray:

@@ -49,7 +49,7 @@ def live(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFac
     player_command = [sys.executable, "-m", "umf_ros.lab.live.bag_player_node", str(mini_bag), "--rate", "0.5"]
     try:
         for node in nodes:
-            node.wait_for("ready")
+            node.wait_for("waiting for topics")  # no parameter names one
         player = Process("", folder / "player.log", command=[*player_command, "--wait-for-subscribers", "--quiet"])
         wait_until(lambda: player.exit_code is not None, 240)
         assert player.exit_code == 0, player.output

@@ -115,6 +115,6 @@ def test_pose_and_transform_come_once_the_rover_is_found(rover: Rover, map_folde
 
 
 def test_a_map_that_is_none_is_told_in_one_line(tmp_path: Path) -> None:
-    process = Process(MODULE, tmp_path / "node.log", "mode:=localization", f"map:={tmp_path}")
+    process = Process(MODULE, tmp_path / "node.log", "mode:=localization", f"map:={tmp_path}", "dataset:=simulated")
     assert wait_until(lambda: process.exit_code is not None, 60.0) and process.exit_code == 1
     assert "run umf map to solve the map" in (tmp_path / "node.log").read_text()

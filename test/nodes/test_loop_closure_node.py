@@ -26,6 +26,8 @@ from umf_ros.places.database import PlaceDatabase
 MODULE = "umf_ros.nodes.loop_closure_node"
 # a thumbnail needs no weights; no odometry or camera_info, so that nothing waits for them
 PARAMETERS = (
+    "topics.left_image:=/stereo/left/image_rect",
+    "topics.cloud:=/bf_lidar/points_raw",
     "embedding.method:=thumbnail",
     "topics.odometry:=''",
     "topics.left_info:=''",

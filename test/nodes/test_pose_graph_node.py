@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.srv import AddDiagnostics
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -26,10 +27,18 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from umf_ros.absolute.measurement import Aid
-from umf_ros.core.geometry import Array
+from umf_ros.core.geometry import Array, relative, to_quaternion
 from umf_ros.lab.datasets.g2o import read_g2o
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, open_ground, rover_loops, with_wrong_closures
-from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, closure_to_message, from_time, to_pose, to_time
+from umf_ros.nodes.conversions import (
+    CLOSURES_QOS,
+    LATCHED_QOS,
+    closure_to_message,
+    from_time,
+    parse_pair,
+    to_pose,
+    to_time,
+)
 from umf_ros.sensors.decode import decode_pose
 
 MODULE = "umf_ros.nodes.pose_graph_node"
@@ -224,7 +233,7 @@ def test_no_message_ends_the_node(rig: Rig, process: Process) -> None:
 
 
 def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Path) -> None:
-    parameters = f"results_dir:={tmp_path / 'results'}", "pose_graph.max_gap_s:=3"
+    parameters = f"results_dir:={tmp_path / 'results'}", "pose_graph.max_gap_s:=3", "dataset:=simulated"
     process = Process(MODULE, tmp_path / "one.log", *parameters)
     process.wait_for("ready")
     rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
@@ -250,7 +259,7 @@ def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Pat
 
 
 def test_a_namespace_is_a_robot(rig: Rig, process: Process, tmp_path: Path) -> None:
-    other = Process(MODULE, tmp_path / "other.log", "__ns:=/other")
+    other = Process(MODULE, tmp_path / "other.log", "__ns:=/other", "dataset:=simulated")
     other.wait_for("ready")
     rig.until(lambda: rig.closures.get_subscription_count() and "other/pose_graph_node: pose graph" in rig.inputs)
     assert {name for name, _ in rig.get_topic_names_and_types()} >= {"/other/loop_closures", "/other/odom"}
@@ -341,6 +350,50 @@ def test_services_revoke_save_and_reset(rig: Rig, process: Process, tmp_path: Pa
     assert process.exit_code is None
 
 
+def test_edges_are_edited_by_hand_and_undone_by_name(rig: Rig, process: Process, tmp_path: Path) -> None:
+    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    rig.drive(0, len(rig.world.truth))
+    for row in range(len(rig.world.closures)):
+        rig.closures.publish(closure_to_message(rig.world.message(row)))
+    rig.until(lambda: len(verdicts(rig)) == len(rig.world.closures))
+
+    def call(service: str, text: str) -> AddDiagnostics.Response:
+        client = rig.create_client(AddDiagnostics, f"/pose_graph_node/{service}")
+        assert client.wait_for_service(20.0)
+        future = client.call_async(AddDiagnostics.Request(load_namespace=text))
+        rig.until(future.done)
+        return future.result()
+
+    right = next(name for name, verdict in verdicts(rig).items() if verdict == "accepted")
+    answer = call("reject_edge", right)
+    assert answer.success and answer.message == f"closure {right} rejected: revoked by hand"
+    rig.until(lambda: verdicts(rig)[right] == "rejected")
+    answer = call("undo_edit", right)
+    assert answer.success and "by hand" not in answer.message
+    answer = call("add_closure", right)
+    assert answer.success and answer.message == f"closure {right} accepted: accepted by hand"
+    # one that the front-end did not find
+    truth = rig.world.truth
+    x, y, z = relative(truth[10], truth[20])[:3, 3]
+    turn = " ".join(map(str, to_quaternion(relative(truth[10], truth[20]))))
+    new = f"keyframe/{10 * PERIOD_NS} keyframe/{20 * PERIOD_NS}"
+    answer = call("add_closure", f"{new} {x} {y} {z} {turn} 0.1 1.0")
+    assert answer.success and answer.message == f"closure {new} accepted: accepted by hand"
+    rig.until(lambda: verdicts(rig).get(new) == "accepted")
+    for text, told in (
+        ("keyframe/1 keyframe/2", "no closure between keyframes 1 and 2"),
+        ("nonsense", "'nonsense' is no pair of keyframes"),
+        (f"{new} 1 2 3", "is no pose"),
+        (f"{new} 1 2 3 0 0 0 0 1 1", "is no pose"),
+    ):
+        answer = call("add_closure", text)
+        assert not answer.success and told in answer.message
+    assert process.interrupt() == 0
+    rows = list(csv.DictReader((tmp_path / "results" / "graph_verdicts.csv").open()))
+    by_hand = {(int(row["match_stamp_ns"]), int(row["query_stamp_ns"])) for row in rows if "by hand" in row["reason"]}
+    assert by_hand == {(10 * PERIOD_NS, 20 * PERIOD_NS), parse_pair(right)}
+
+
 def test_a_clock_that_goes_back_begins_a_session(rig: Rig, process: Process) -> None:
     rig.until(lambda: rig.odometry.get_subscription_count())
     rig.drive(0, 60)
@@ -363,7 +416,12 @@ def test_fixes_over_dds_are_decided_about_and_told(ros_context: None, tmp_path: 
     world = open_ground(10_004, 300.0)
     rig = Rig(world.graph)
     fixes, results = rig.create_publisher(NavSatFix, "/gnss/fix", 50), tmp_path / "results"
-    arguments = ("absolute.gnss:=/gnss/fix", "pose_graph.max_gap_s:=3", "pose_graph.odometry_sigma_deg:=0.1")
+    arguments = (
+        "absolute.gnss:=/gnss/fix",
+        "topics.odometry:=/odom",
+        "pose_graph.max_gap_s:=3",
+        "pose_graph.odometry_sigma_deg:=0.1",
+    )
     process = Process(MODULE, tmp_path / "node.log", f"results_dir:={results}", *arguments)
     try:
         process.wait_for("ready")

@@ -34,8 +34,7 @@ from umf_ros.lab.datasets.g2o import (
     write_plane,
 )
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.pose_graph.closures import VERDICT_COLUMNS
-from umf_ros.pose_graph.g2o import verdict_table
+from umf_ros.pose_graph.closures import VERDICT_COLUMNS, verdict_table
 from umf_ros.pose_graph.solver import Edge
 
 WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))

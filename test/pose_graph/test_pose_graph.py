@@ -144,12 +144,12 @@ def test_a_closure_between_odometry_stamps_is_interpolated() -> None:
 def test_revoking_by_hand_lasts_and_says_so(driven: PoseGraph) -> None:
     graph = drive(WORLD)
     first, second = sorted(accepted(graph))[0]
-    (verdict,) = graph.revoke(first * PERIOD_NS, second * PERIOD_NS)
+    (verdict,) = graph.decide_by_hand(first * PERIOD_NS, second * PERIOD_NS, State.REJECTED)
     assert verdict.state is State.REJECTED and "by hand" in verdict.reason
     graph.settle()
     assert accepted(graph) == accepted(driven) - {(first, second)}
     with pytest.raises(GraphError, match="no closure between"):
-        graph.revoke(1, 2)
+        graph.decide_by_hand(1, 2, State.REJECTED)
 
 
 def test_a_correction_larger_than_allowed_is_refused() -> None:

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graph_worlds import SETTINGS, accepted, closing, feed_odometry, lap_pairs, rms, two_laps
+from graph_worlds import CLOSURE_COVARIANCE, SETTINGS, accepted, closing, feed_odometry, lap_pairs, rms, two_laps
 
 from umf_ros.core.config import PoseGraphSettings
-from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld
+from umf_ros.core.errors import GraphError
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, WorldClosure
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 
@@ -133,7 +134,7 @@ def test_a_revoked_closure_leaves_no_trace_in_the_map() -> None:
         for row in range(len(each.closures)):
             graph.add_closure(each.message(row))
         graphs.append(graph)
-    graphs[0].revoke(15 * PERIOD_NS, 115 * PERIOD_NS)
+    graphs[0].decide_by_hand(15 * PERIOD_NS, 115 * PERIOD_NS, State.REJECTED)
     for graph in graphs:
         graph.settle()
     assert accepted(graphs[0]) == accepted(graphs[1])
@@ -146,7 +147,7 @@ def test_what_a_person_revoked_stays_out_even_when_all_is_judged_anew() -> None:
     feed_odometry(graph, world, (k for k in range(200) if k != 50))
     for row in range(3):
         graph.add_closure(world.message(row))
-    graph.revoke(15 * PERIOD_NS, 115 * PERIOD_NS)
+    graph.decide_by_hand(15 * PERIOD_NS, 115 * PERIOD_NS, State.REJECTED)
     feed_odometry(graph, world, [50])
     graph.settle()
     verdicts = {v.closure.match_stamp_ns // PERIOD_NS: v for v in graph.closures()}
@@ -213,7 +214,7 @@ def test_a_second_measurement_of_a_pair_is_weighed_against_the_first() -> None:
     found = [(verdict.state, verdict.closure.match_T_query[0, 3] > 20) for verdict in graph.closures()]
     assert sorted(found) == [(State.ACCEPTED, False)] * 4 + [(State.REJECTED, True)]
     ends = world.message(1).match_stamp_ns, world.message(1).query_stamp_ns
-    graph.revoke(*ends)
+    graph.decide_by_hand(*ends, State.REJECTED)
     assert graph.verdict_counts() == {State.ACCEPTED: 3, State.REJECTED: 2}
 
 
@@ -247,3 +248,24 @@ def test_a_closure_before_all_odometry_waits_for_it() -> None:
             assert graph.update() == []
     graph.settle()
     assert graph.verdict_counts() == {State.ACCEPTED: 1}
+
+
+def test_what_a_person_accepts_stays_until_it_is_undone() -> None:
+    """A wrong closure, contradicted by right ones of three places."""
+    world = closing(two_laps(), lap_pairs(0, 30, 60, 90))
+    wrong = WorldClosure(20, 160, np.eye(4), CLOSURE_COVARIANCE, False)
+    world = replace(world, closures=[*world.closures, wrong])
+    graph, ends = driven(world), (20 * PERIOD_NS, 160 * PERIOD_NS)
+    for row in range(len(world.closures)):
+        graph.add_closure(world.message(row))
+    assert (20, 160) not in accepted(graph)
+    (verdict,) = [one for one in graph.decide_by_hand(*ends, State.ACCEPTED) if one.closure.match_stamp_ns == ends[0]]
+    assert (verdict.state, str(verdict.reason)) == (State.ACCEPTED, "accepted by hand")
+    graph.settle()
+    assert (20, 160) in accepted(graph)
+    graph.decide_by_hand(*ends, State.PENDING)
+    assert (20, 160) not in accepted(graph)
+    graph.settle()
+    assert accepted(graph) == {(0, 100), (30, 130), (60, 160), (90, 190)}
+    with pytest.raises(GraphError, match="no closure between keyframes 1 and 2"):
+        graph.decide_by_hand(1, 2, State.ACCEPTED)

@@ -12,6 +12,7 @@ from finished_runs import BELOW, START_NS, accepted, candidate, closure, examine
 from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, traverse, write_mcap
 
 from umf_ros.bags.inputs import Advice, useless_inputs
+from umf_ros.bags.overlay import Overlay
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.sensor_check import Disagreement, SensorReport
 from umf_ros.core.config import load_settings
@@ -122,6 +123,35 @@ def test_closures_that_the_graph_did_not_use_are_pending_not_rejected(tmp_path: 
     assert "the graph used none of them (1 pending)" in sentence and "rejected" not in sentence
 
 
+@pytest.mark.parametrize(
+    ("state", "reason", "said", "helps"),
+    [
+        (
+            State.REFUSED,
+            ClosureReason.BEFORE_ODOMETRY,
+            "the graph refused 1 of 1 closures (no odometry at",
+            "must reach",
+        ),
+        (
+            State.REJECTED,
+            ClosureReason.CONTRADICTS,
+            "the graph rejected 1 of 1 closures (contradicts the",
+            "odometry worse",
+        ),
+    ],
+)
+def test_closures_without_odometry_are_not_laid_to_its_errors(
+    tmp_path: Path, state: State, reason: ClosureReason, said: str, helps: str
+) -> None:
+    found = look_first(examined(tmp_path, [closure(50, 10)], verdict=accepted(state, reason), truth=trajectory()))
+    told = next(one for one in found if one.what.startswith("the graph"))
+    assert (
+        told.what.startswith(said)
+        and helps in told.remedy
+        and ("sigma in the median" in told.what) == (state is State.REJECTED)
+    )
+
+
 def test_false_closures_come_with_the_threshold_that_excludes_them(tmp_path: Path) -> None:
     closures = [closure(50, 10, probability=0.99), closure(52, 12, error_m=0.9, probability=0.93)]
     about = examined(tmp_path, closures, verdict=accepted(), truth=trajectory())
@@ -146,6 +176,10 @@ LIDAR = Disagreement(0.0, np.array([0.0, 9.0, 1.0]))
 FINE = Disagreement(0.0, np.array([0.5, 1.0, -2.5]))
 
 
+def laid_over(scale: float) -> Overlay:
+    return Overlay(np.array([0.1, 0.2, -0.1]), scale, 0.003, np.array([0.1, 0.001, 0.002]))
+
+
 @pytest.mark.parametrize(
     ("sensors", "said"),
     [
@@ -153,7 +187,7 @@ FINE = Disagreement(0.0, np.array([0.5, 1.0, -2.5]))
         (SensorReport(left_contrast=5.0), "the left images show little"),
         (SensorReport(returns=120), "scans have 120 returns in the median"),
         (SensorReport(intensity_max=0.0), "all intensities are 0"),
-        (SensorReport(stereo_scale=1.5), "stereo sees everything 1.50 times as far as the LiDAR"),
+        (SensorReport(overlay=laid_over(1.5)), "stereo sees everything 1.5 times as far as the LiDAR"),
         (SensorReport(lidar=LIDAR, camera=FINE), "the LiDAR's mounting is off by 9 deg, mostly about y (+9 deg)"),
         (SensorReport(lidar=LIDAR, camera=LIDAR), "the odometry is not of the body frame"),
         (SensorReport(forward=np.array([0, 0, 0.9])), "the odometry is not of the body: by its poses"),
@@ -173,7 +207,7 @@ def test_what_is_wrong_with_the_sensors_is_said_with_its_number(
 
 
 def test_sensors_that_agree_are_not_mentioned(tmp_path: Path) -> None:
-    fine = SensorReport(50.0, 50.0, 9000.0, 200.0, 1.01, FINE, FINE, np.array([0.99, 0.1, 0.0]))
+    fine = SensorReport(50.0, 50.0, 9000.0, 200.0, laid_over(1.005), FINE, FINE, np.array([0.99, 0.1, 0.0]))
     assert look_first(examined(tmp_path, [closure(50, 10)], verdict=accepted(), sensors=fine)) == []
 
 

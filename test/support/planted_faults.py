@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 import yaml
 
-from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
-from umf_ros.bags.sensor_check import SensorCheck, SensorReport, about_sensors
+from umf_ros.bags.sensor_check import about_sensors
 from umf_ros.bags.storages import RawMessage, message_types
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings, load_preset, topics_of
 from umf_ros.core.geometry import from_quaternion, to_quaternion
 from umf_ros.core.trajectory import Trajectory, write_tum
+from umf_ros.lab.evaluation.sensors_run import check_sensors
 from umf_ros.lab.simulation.bag_writer import BagWriter
-from umf_ros.sensors.decode import OdometrySample, decode_pose
+from umf_ros.sensors.decode import decode_pose
 
 Change = Callable[[str, Any], Any]
 """From topic and message to the message that is recorded instead; None drops it."""
@@ -220,18 +220,6 @@ class ChangedBag(Bag):
         for raw in super().raw_messages(topics):
             message = self._change(raw.topic, types.deserialize_cdr(raw.data, raw.type))
             yield replace(raw, data=bytes(types.serialize_cdr(message, raw.type)))
-
-
-def check_sensors(bag: Bag, settings: Settings) -> SensorReport:
-    """Return the check of a recording's measurements against each other."""
-    check, stamps, poses = SensorCheck(), [], []
-    for item in FrameReader(bag, settings, warn=lambda text: None).stream():
-        if isinstance(item, OdometrySample):
-            stamps.append(item.stamp_ns)
-            poses.append(item.odom_T_body)
-        else:
-            check.take(item)
-    return check.report(Trajectory(np.array(stamps, np.int64), np.stack(poses)) if stamps else None)
 
 
 def measured_offset(bag: Bag, sensor: str, seconds: float) -> float | None:

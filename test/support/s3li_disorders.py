@@ -2,7 +2,7 @@
 
 python test/support/s3li_disorders.py OUT [--seed 20001] [--only NAME,NAME]
 
-Simulates one short sequence of the twin for every disorder, without that disorder, and runs it as `umf s3li` does.
+Simulates one drive of 40 m of the twin for every disorder, without that disorder, and runs it as `umf s3li` does.
 The readers expect each disorder: without it, positions in UTC are read as GPS time, and 0.1 s are added to scans that
 are on time. A row holds the first lines that were printed about it, and the figures.
 """
@@ -18,10 +18,12 @@ from typing import Any
 from umf_ros.core.errors import UmfError
 from umf_ros.lab.datasets.s3li_folder import find_s3li
 from umf_ros.lab.evaluation.s3li_run import in_own_process, replay_sequence
-from umf_ros.lab.simulation.twin import write_twin
+from umf_ros.lab.simulation import twin
 from umf_ros.lab.simulation.twin_files import Disorders
 
 ETNA, VULCANO = "s3li_loops", "capo_grillo"
+LENGTHS_M = 40.0, 24.0
+"""Of the drive and of its loop."""
 AS_IT_IS = "none taken out"
 SHOWN = ("closures_true", "closures_false", "pose_error_m", "ate_odometry_m", "ate_optimized_m")
 NAMED = {"gps_time": "GPS time", "imu_frame": "odometry is not of the body"}
@@ -34,7 +36,8 @@ def run(folder: Path, seed: int, taken_out: str) -> dict[str, Any]:
     """Figures of one sequence without one disorder."""
     name = VULCANO if taken_out == "baseline" else ETNA
     disorders = Disorders() if taken_out == AS_IT_IS else replace(Disorders(), **{taken_out: False})
-    for _ in write_twin(folder, seed, 0.05, (name,), disorders):
+    twin.SHORTEST_M, twin.SHORTEST_LOOP_M = LENGTHS_M
+    for _ in twin.write_twin(folder, seed, 0.01, (name,), disorders):
         pass
     sequence = find_s3li(folder).sequences[0]
     try:

@@ -15,7 +15,7 @@ from umf_ros.verification.visibility import Sight
 
 GROUND = landscape(20)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
-READY = ("view", "terrain", "range_images", "spacing", "coarse_cloud", "sample_cloud", "cloud", "up")
+READY = ("view", "terrain", "range_images", "spacing", "scouts_cloud", "sample_cloud", "cloud", "up")
 
 
 def test_a_scan_is_ready_once_and_forgotten_when_stamps_start_over() -> None:

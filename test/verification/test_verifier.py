@@ -13,7 +13,7 @@ from umf_ros.core.frames import Candidate, Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, make_pose, near, relative, rotation_angle
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
-from umf_ros.verification.constants import SAME_M, SAME_RAD
+from umf_ros.verification import constants as const
 from umf_ros.verification.hypothesis import SCAN
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
@@ -277,7 +277,7 @@ def test_hypotheses_that_end_at_one_pose_are_judged_once(verifier: Verifier) -> 
     poses = [one.pose for one in judged]
     assert poses
     for number, pose in enumerate(poses):
-        assert not any(near(pose, other, SAME_M, SAME_RAD) for other in poses[:number])
+        assert not any(near(pose, other, const.DISTINCT_M, const.DISTINCT_RAD) for other in poses[:number])
 
 
 def rivals_known(verdicts: list[Hypothesis]) -> list[bool]:

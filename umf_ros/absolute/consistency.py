@@ -45,10 +45,15 @@ _FEW_STRETCHES = 15
 _MOUNTING = {Aid.GNSS: (0.5, 1.0), Aid.GRAVITY: (np.deg2rad(2.5), np.deg2rad(1.0))}
 _LEAST_SIGMA_M = 0.05
 _STEP = np.log(1.2)
+MOST_HELD = 400
+"""Factors of a session and source: each is a vertex, and all are solved with every event (*by hand*: over 4 km)."""
+# by this factor the path grows until all is decided again; until then, only what its end can change
+_REJUDGE = 1.1
 
 Rows = NDArray[np.int64]
 Decision = tuple[State, AbsoluteReason]
 _AGREES = State.ACCEPTED, AbsoluteReason.AGREES
+_INCOMPLETE = State.PENDING, AbsoluteReason.INCOMPLETE
 _JUMPED = State.REJECTED, AbsoluteReason.JUMPED
 _CONTRADICTS = State.REJECTED, AbsoluteReason.CONTRADICTS
 _MOUNTED_WRONG = State.REJECTED, AbsoluteReason.MOUNTING
@@ -65,7 +70,9 @@ def attitude_drift(noise: OdometryNoise, path_m: Array) -> Array:
     return (noise.scale * noise.sigma_rad) ** 2 * path_m + (_SYSTEMATIC_RAD * path_m) ** 2
 
 
-def longest_chain(values: Array, variances: Array, path_m: Array, drift: Array) -> NDArray[np.bool_]:
+def longest_chain(
+    values: Array, variances: Array, path_m: Array, drift: Array, known: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
     """(N,) members of the longest chain of measurements along the path.
 
     Args:
@@ -73,9 +80,14 @@ def longest_chain(values: Array, variances: Array, path_m: Array, drift: Array) 
         variances: (N, 3) of the values.
         path_m: (N,) where they are along the path, rising.
         drift: (K,) variance of the drift over 0, 1, 2, ... metres; beyond, the last.
+        known: (M,) whether the first M are members, as was found before.
     """
     best, before = np.ones(len(values)), np.full(len(values), -1)
-    for row in range(1, len(values)):
+    begun = 0 if known is None else len(known)
+    if known is not None:  # members go on with the chain that led to them
+        rows = np.flatnonzero(known)
+        best[rows], before[rows[1:]] = np.arange(1, len(rows) + 1), rows[:-1]
+    for row in range(max(1, begun), len(values)):
         start = max(0, row - _REACH)
         apart = drift[np.minimum((path_m[row] - path_m[start:row]).astype(int), len(drift) - 1)]
         spread = variances[start:row] + variances[row] + apart[:, None]
@@ -154,14 +166,16 @@ class Factor(NamedTuple):
     """The average of the measurements of a stretch.
 
     Attributes:
-        stamp_ns: of its pose.
+        stamp_ns: of its middle.
+        middle: (4, 4) odometry there.
         numbers: those that determine it.
-        make: makes the factor of a vertex with a number.
+        make: makes the factor of a vertex with a number, in whose frame the middle is at a pose (4, 4).
     """
 
     stamp_ns: int
+    middle: Array
     numbers: tuple[float, ...]
-    make: Callable[[int], gtsam.NonlinearFactor]
+    make: Callable[[Array, int], gtsam.NonlinearFactor]
 
 
 @dataclass(frozen=True)
@@ -181,6 +195,11 @@ class MeasuredPath:
     travel: Array
     finished: int
     at_middle: Callable[[int], tuple[int, Array]]
+
+    def since(self, row: int) -> MeasuredPath:
+        """The path from a measurement on."""
+        parts = self.odometry[row:], self.poses[row:], self.travel[row:]
+        return MeasuredPath(*parts, self.finished, self.at_middle)
 
 
 @dataclass(frozen=True)
@@ -222,13 +241,27 @@ class Track:
         self._decisions: list[Decision] = []
         self._misfits = self._distances = np.empty(0)
         self._solved: set[int] = set()
+        self._chain: set[int] = set()  # stretches
+        self._judged = self._judged_whole = 0
+        self._scale, self._mounted = 1.0, _AGREES
         self.mounting: Array | None = None
         self.factors: dict[int, Factor] = {}
 
     def add(self, measurements: list[AbsoluteMeasurement]) -> None:
         """Take measurements; their verdicts are open until `judge`."""
+        known, last_ns = len(self._measurements), self._measurements[-1].stamp_ns if self._measurements else 0
         self._measurements = sorted([*self._measurements, *measurements], key=lambda one: one.stamp_ns)
-        self._decide_all((State.PENDING, AbsoluteReason.INCOMPLETE))
+        self._decisions += [_INCOMPLETE] * len(measurements)
+        more = np.full(len(measurements), np.nan)
+        self._misfits, self._distances = np.append(self._misfits, more), np.append(self._distances, more)
+        if self._measurements[known:] and min(one.stamp_ns for one in measurements) < last_ns:
+            self._judged_whole = 0
+
+    @property
+    def held(self) -> dict[int, Factor]:
+        """Factors that hold the map, by stretch: all of them or, of a long path, evenly spread ones."""
+        every = -(-len(self.factors) // MOST_HELD)
+        return {cell: one for cell, one in self.factors.items() if every < 2 or cell % every == 0}
 
     @property
     def stamps(self) -> Rows:
@@ -260,32 +293,60 @@ class Track:
             return None
         return make_pose(turned(np.eye(3), direction).T, np.median(ends[0] - turned(ends[1], direction), axis=0))
 
-    def judge(self, measured: Array, path: MeasuredPath, in_world: bool) -> None:
-        """Decide about all measurements; `measured` (N, 3) are positions in the world, or upward directions."""
-        self.factors = {}
+    def judge(self, measured: Array, path: MeasuredPath, in_world: bool, at_last: bool = False) -> None:
+        """Decide about measurements; `measured` (N, 3) are positions in the world, or upward directions.
+
+        About all of them now and then and at last, else about those of the newest stretches.
+        """
         if self.mounting is not None:
+            self.factors = {}
             self._decide_all(_MOUNTED_WRONG)
             return
-        self._decide_all((State.PENDING, AbsoluteReason.INCOMPLETE))
-        values, rotations = self._drifting(measured, path)
-        scale = _scatter(values, self._variances, _Stretches.of(values, self._variances, path))
-        variances = scale**2 * self._variances
+        first = self._judged - 2 * _REACH
+        whole = at_last or first <= 0 or path.finished > _REJUDGE * self._judged_whole
+        row = 0 if whole else int(np.searchsorted(path.travel, first * STRETCH_M))
+        if whole:
+            self._decide_all(_INCOMPLETE)
+            self.factors, self._judged_whole = {}, path.finished
+        self._judge_since(row, measured[row:], path.since(row), in_world, whole)
+        self._judged = path.finished
+
+    def _judge_since(self, row: int, measured: Array, path: MeasuredPath, in_world: bool, whole: bool) -> None:
+        """Decide about the measurements of stretches from a row on; what comes before is context unless it is `whole`.
+
+        `measured` (M, 3) and the path begin there.
+        """
+        levers, variances = self._levers[row:], self._variances[row:]
+        values, rotations = self._drifting(measured, path, levers)
+        if whole:
+            self._scale = _scatter(values, variances, _Stretches.of(values, variances, path))
+        variances = self._scale**2 * variances
         stretches = _Stretches.of(values, variances, path)
-        members = longest_chain(stretches.middles, stretches.spreads, stretches.travel, self._drift)
-        firm = supported(members, stretches.spreads, stretches.travel, self._drift)
-        source = self._judge_mounting(stretches, members, rotations)
+        parts = stretches.middles, stretches.spreads, stretches.travel, self._drift
+        begun = 0 if whole else int(np.searchsorted(stretches.cells, self._judged - _REACH))
+        known = np.array([cell in self._chain for cell in stretches.cells[:begun].tolist()], bool)
+        members = longest_chain(*parts, known)
+        firm = supported(members, *parts[1:])
+        self._chain = {cell for cell in self._chain if cell < stretches.cells[0]} if len(members) else set()
+        self._chain |= set(stretches.cells[members].tolist())
+        if whole:
+            self._mounted = self._judge_mounting(stretches, members, rotations)
         if in_world:
-            missed = self._missed(measured, path)
-            self._misfits, self._distances = np.linalg.norm(missed, axis=1), (missed**2 / variances).sum(axis=1)
-        for number, rows in enumerate(stretches.rows):
-            if not firm[number] or source != _AGREES:
+            missed = self._missed(measured, path, levers)
+            self._misfits[row:] = np.linalg.norm(missed, axis=1)
+            self._distances[row:] = (missed**2 / variances).sum(axis=1)
+        for number in range(begun, len(stretches.rows)):
+            rows, cell = stretches.rows[number], int(stretches.cells[number])
+            self.factors.pop(cell, None)
+            if not firm[number] or self._mounted != _AGREES:
                 unsure = State.PENDING, AbsoluteReason.UNSURE
-                self._decide(rows, _JUMPED if not members[number] else unsure if not firm[number] else source)
+                reason = _JUMPED if not members[number] else unsure if not firm[number] else self._mounted
+                self._decide(row + rows, reason)
                 continue
             near = ((values[rows] - stretches.middles[number]) ** 2 / variances[rows]).sum(axis=1) <= GATE
-            kept = self._judge_stretch(int(stretches.cells[number]), rows, near)
+            kept = self._judge_stretch(cell, row + rows, near) - row
             if len(kept):
-                self._average(int(stretches.cells[number]), kept, measured, path, scale)
+                self._average(cell, kept, measured, path, levers, row)
 
     def _judge_stretch(self, cell: int, rows: Rows, near: NDArray[np.bool_]) -> Rows:
         """Decide about the measurements of a stretch that is consistent with others; returns those that are accepted.
@@ -319,7 +380,7 @@ class Track:
         self._decisions = [decision] * len(self._measurements)
         self._misfits, self._distances = np.full((2, len(self._measurements)), np.nan)
 
-    def _drifting(self, measured: Array, path: MeasuredPath) -> tuple[Array, Array]:
+    def _drifting(self, measured: Array, path: MeasuredPath, levers: Array) -> tuple[Array, Array]:
         """(N, 3) what drifts slowly, and the rotations (N, 3, 3) of the body with which an error of its mounting turns.
 
         Positions less those by dead reckoning with the attitudes of the map; directions by the odometry's attitudes.
@@ -328,7 +389,7 @@ class Track:
             return apply(path.odometry, measured), path.odometry[:, :3, :3]
         steps = invert(path.odometry[:-1]) @ path.odometry[1:]
         walked = np.cumsum(np.concatenate([np.zeros((1, 3)), apply(path.poses[:-1], steps[:, :3, 3])]), axis=0)
-        return measured - walked - apply(path.poses, self._levers), path.poses[:, :3, :3]
+        return measured - walked - apply(path.poses, levers), path.poses[:, :3, :3]
 
     def _judge_mounting(self, stretches: _Stretches, members: NDArray[np.bool_], rotations: Array) -> Decision:
         """Whether a source may be accepted, by what its error does when the rover turns."""
@@ -350,35 +411,38 @@ class Track:
             return _MOUNTED_WRONG
         return _AGREES
 
-    def _missed(self, measured: Array, path: MeasuredPath) -> Array:
+    def _missed(self, measured: Array, path: MeasuredPath, levers: Array) -> Array:
         """(N, 3) by what the measurements miss the map."""
         if self._source is Aid.GRAVITY:
             return apply(path.poses, measured) - [0.0, 0.0, 1.0]
-        return measured - path.poses[:, :3, 3] - apply(path.poses, self._levers)
+        return measured - path.poses[:, :3, 3] - apply(path.poses, levers)
 
-    def _average(self, cell: int, rows: Rows, measured: Array, path: MeasuredPath, scale: float) -> None:
-        """Make the factor of a stretch: on a rigid path, the mean of positions is that of the mean of their levers."""
+    def _average(self, cell: int, rows: Rows, measured: Array, path: MeasuredPath, levers: Array, first: int) -> None:
+        """Make the factor of a stretch: on a rigid path, the mean of positions is that of the mean of their levers.
+
+        `rows` count from the `first` measurement of the path.
+        """
         stamp_ns, middle = path.at_middle(cell)
         there = invert(middle) @ path.odometry[rows]
         # as of one measurement: errors of GNSS last for longer than a stretch
-        covariance = np.mean([self._measurements[row].covariance for row in rows], axis=0) * scale**2
+        covariance = np.mean([self._measurements[first + row].covariance for row in rows], axis=0) * self._scale**2
         if self._source is Aid.GNSS:
             mean = measured[rows].mean(axis=0)
-            lever = (there[:, :3, 3] + apply(there, self._levers[rows])).mean(axis=0)
+            lever = (there[:, :3, 3] + apply(there, levers[rows])).mean(axis=0)
             noise = gtsam.noiseModel.Gaussian.Covariance(covariance + _LEAST_SIGMA_M**2 * np.eye(3))
             numbers = stamp_ns, *mean, *lever, covariance.trace()
 
-            def make(vertex: int) -> gtsam.NonlinearFactor:
-                return gtsam.GPSFactorArm(vertex, mean, lever, noise)
+            def make(pose: Array, vertex: int) -> gtsam.NonlinearFactor:
+                return gtsam.GPSFactorArm(vertex, mean, pose[:3, :3] @ lever + pose[:3, 3], noise)
         else:
             up = apply(there, measured[rows]).mean(axis=0)
             tilt = gtsam.noiseModel.Isotropic.Sigma(2, float(np.sqrt(covariance.trace() / 3)))
             numbers = stamp_ns, *up, covariance.trace()
 
-            def make(vertex: int) -> gtsam.NonlinearFactor:
-                return gtsam.AttitudeFactorPose3(vertex, gtsam.Unit3([0, 0, 1]), tilt, gtsam.Unit3(up))
+            def make(pose: Array, vertex: int) -> gtsam.NonlinearFactor:
+                return gtsam.AttitudeFactorPose3(vertex, gtsam.Unit3([0, 0, 1]), tilt, gtsam.Unit3(pose[:3, :3] @ up))
 
-        self.factors[cell] = Factor(stamp_ns, tuple(round(float(number), 6) for number in numbers), make)
+        self.factors[cell] = Factor(stamp_ns, middle, tuple(round(float(number), 6) for number in numbers), make)
 
 
 def apply(poses: Array, vectors: Array) -> Array:

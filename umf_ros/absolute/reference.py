@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -214,10 +215,15 @@ class AbsoluteReference:
             found["elevation rejected as a whole"] = AbsoluteReason.MISFIT.value
         return found
 
-    def stamps(self, session: int) -> Rows:
-        """(K,) stamps of the poses of a session that accepted measurements are about."""
+    def stamps(self, session: int, travel: Array) -> Rows:
+        """(K,) stamps of more vertices that accepted measurements of a session need, beside those at (N,) `travel`."""
+        held = set((travel // STRETCH_M).astype(int).tolist())
         stamps = [
-            one.stamp_ns for (own, _), track in self._tracks.items() if own == session for one in track.factors.values()
+            one.stamp_ns
+            for (own, _), track in self._tracks.items()
+            if own == session
+            for cell, one in track.held.items()
+            if cell not in held
         ]
         stamps += [
             stamp
@@ -256,11 +262,7 @@ class AbsoluteReference:
         held, factors, planes, loose = poses.copy(), list[Any](), list[tuple[list[int], bool]](), dict[int, Any]()
         for component, first in firsts.items():
             tracks = [one for one in self._tracks.items() if components[one[0][0]] == component and one[1].factors]
-            factors += [
-                (rows[session, one.stamp_ns], one.make)
-                for (session, _), track in tracks
-                for one in track.factors.values()
-            ]
+            factors += [one for (session, _), track in tracks for one in _attached(track, session, points)]
             sources = {source for (_, source), _ in tracks}
             heights = self._heights.get(component)
             if heights is not None and heights.fits:
@@ -303,7 +305,7 @@ class AbsoluteReference:
         for (session, source), track in sorted(
             self._tracks.items(), key=lambda one: (one[0][1] is Aid.GNSS, one[0][0])
         ):
-            before = {cell: factor.numbers for cell, factor in track.factors.items()}
+            before = {cell: factor.numbers for cell, factor in track.held.items()}
             component, measured = paths.components[session], self._measured(source, track)
             path = self._path(track, session, paths, at_last)
             if source is Aid.GNSS and track.mounting is None and not self._has_gnss(component, paths):
@@ -316,10 +318,10 @@ class AbsoluteReference:
                 path = MeasuredPath(
                     path.odometry, self.worlds[component] @ path.poses, path.travel, path.finished, path.at_middle
                 )
-            track.judge(measured, path, known)
+            track.judge(measured, path, known, at_last)
             if track.factors and not known:
                 self.worlds[component] = _upright(apply(path.poses, measured).mean(axis=0))
-            changed = changed or before != {cell: factor.numbers for cell, factor in track.factors.items()}
+            changed = changed or before != {cell: factor.numbers for cell, factor in track.held.items()}
         return changed
 
     def _path(self, track: Track, session: int, paths: Paths, at_last: bool) -> MeasuredPath:
@@ -437,6 +439,19 @@ class AbsoluteReference:
         turn = turned(np.eye(3), np.deg2rad(start[2]) - float(heading(level @ first))).T @ level[:3, :3]
         height = np.nan_to_num(model.at(start[None, :2])[0][0])
         self.worlds[component] = make_pose(turn, np.array([*start[:2], height]) - turn @ first[:3, 3])
+
+
+def _attached(track: Track, session: int, points: NDArray[np.void]) -> Factors:
+    """Factors of a track, each at the vertex that is nearest to the middle of its stretch: the odometry carries it."""
+    own, factors = np.flatnonzero(points["session"] == session), track.held
+    travel, middles = points["travel"][own], (np.array(list(factors)) + 0.5) * STRETCH_M
+    after = np.searchsorted(travel, middles).clip(1, max(1, len(own) - 1))
+    before = middles - travel[after - 1] < travel[after.clip(max=len(own) - 1)] - middles
+    rows = own[np.where(before, after - 1, after.clip(max=len(own) - 1))]
+    poses = invert(points["pose"][rows]) @ np.array([one.middle for one in factors.values()]).reshape(-1, 4, 4)
+    return [
+        (row, partial(one.make, pose)) for row, pose, one in zip(rows.tolist(), poses, factors.values(), strict=True)
+    ]
 
 
 def _finished(chain: Chain) -> tuple[int, int]:

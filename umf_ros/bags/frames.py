@@ -60,7 +60,8 @@ class FrameReader:
         self._synchronizer = Synchronizer(settings.sync, calibration, inputs, warn)
         self._samples: list[OdometrySample] = []
         transforms = read_transforms(bag) if settings.uses_transforms else StaticTransforms()
-        frames = BodyFrames(settings.frames, transforms, warn, 0.0, calibration) if transforms.version else None
+        known = transforms.version or calibration.is_open
+        frames = BodyFrames(settings.frames, transforms, warn, 0.0, calibration) if known else None
         self._router = MessageRouter(self._synchronizer, topics, warn, self._samples.append, frames)
         self._absolute = _absolute_topics(settings, bag)
         find = frames.pose_of if frames is not None else lambda _: None

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from umf_ros.bags.reader import Bag, decode
-from umf_ros.core.config import DatasetPreset, Settings, load_preset, load_settings
+from umf_ros.core.config import Settings, load_preset, load_settings
 from umf_ros.core.errors import BagError, MessageError
-from umf_ros.core.resources import dataset_names
 from umf_ros.sensors.calibration import load_calibration
+from umf_ros.sensors.tf import TOPIC as TRANSFORMS_TOPIC
+from umf_ros.sensors.topic_finder import known_dataset, must_find, with_topics
 
 SAMPLES = 5
 """Number of camera_info messages that are read: a single one may be damaged."""
@@ -26,14 +27,12 @@ def detect_dataset(bag: Bag, own_calibration: bool = False) -> str:
     Raises:
         BagError: the recording is of no known data set.
     """
-    known = set(bag.topics)
-    scores = {name: _match(load_preset(name), known) for name in dataset_names()}
-    best = max(scores, key=lambda name: scores[name])
-    reason = "" if own_calibration or not scores[best] else _contradiction(bag, best)
-    if not scores[best]:
-        reason = f"the recording has no topic of a known data set (topics: {', '.join(sorted(known)) or 'none'})"
+    best = known_dataset(bag.topics)
+    reason = "" if own_calibration or not best else _contradiction(bag, best)
+    if not best:
+        reason = f"the recording has no topic of a known data set (topics: {', '.join(sorted(bag.topics)) or 'none'})"
     if reason:
-        raise BagError(f"{reason}; set the topics in a config file: umf inspect {bag.path} --write . writes a draft")
+        raise BagError(reason)
     return best
 
 
@@ -55,27 +54,29 @@ def _contradiction(bag: Bag, name: str) -> str:
     return f"the recording has topics of {name}, but {' or '.join(sorted(infos))} is for images of {found}"
 
 
-def _match(preset: DatasetPreset, known: set[str]) -> int:
-    topics = preset.topics
-    if not known & {topics.left_image, topics.cloud} or (preset.mark and preset.mark not in known):
-        return 0
-    return len(known.intersection(topics.model_dump().values())) + bool(preset.mark)
-
-
 def settings_for(bag: Bag, config: Path | None, dataset: str, **overrides: Any) -> Settings:
     """Return settings to read a recording with: those of a parameter file and overrides as in `load_settings`.
 
-    A named data set precedes that of the file; "auto" takes it from the file, or from the recording's topics
-    where the file names neither a data set nor topics.
+    A data set that is named goes before that of the file; "auto" takes it from the file, or from the recording's
+    topics. In a recording of no known data set, topics that the file does not name are found by type.
 
     Raises:
-        ConfigError: the file cannot be read, or a name, type or value is wrong.
-        BagError: the recording's data set is not known.
+        ConfigError: the file cannot be read, a name, type or value is wrong, or several topics fit.
+        BagError: the recording's data set is not known, nor how its sensors are mounted.
     """
     named = None if dataset == "auto" else dataset
     settings = load_settings(config, dataset=named, **overrides)
-    if named is None and not settings.model_fields_set & {"dataset", "topics"}:
-        settings = settings.model_copy(
-            update={"dataset": detect_dataset(bag, own_calibration=bool(settings.calibration))}
-        )
-    return settings
+    if not must_find(settings):
+        return settings
+    try:
+        found = detect_dataset(bag, own_calibration=bool(settings.calibration))
+    except BagError as error:
+        return _found_by_type(bag, settings, str(error))
+    return settings.model_copy(update={"dataset": found})
+
+
+def _found_by_type(bag: Bag, settings: Settings, reason: str) -> Settings:
+    if not settings.calibration and TRANSFORMS_TOPIC not in bag.topics:
+        advice = f"the parameter calibration names a file, and umf inspect {bag.path} --write . writes a first one"
+        raise BagError(f"{reason}, and without {TRANSFORMS_TOPIC} its sensors are anywhere; {advice}")
+    return with_topics(settings, bag.types)

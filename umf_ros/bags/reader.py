@@ -30,6 +30,11 @@ class Bag:
         self.warning = "; ".join(file.warning for file in files if file.warning)
 
     @property
+    def types(self) -> dict[str, str]:
+        """Type of message of the topics that have any."""
+        return {topic: info.type for topic, info in self.topics.items() if info.count}
+
+    @property
     def duration_s(self) -> float:
         """Seconds from the first to the last message."""
         return (self.end_ns - self.start_ns) * 1e-9

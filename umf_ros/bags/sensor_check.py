@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from math import nan
 from typing import Any
 
@@ -13,10 +13,12 @@ import small_gicp
 from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.inputs import Advice
+from umf_ros.bags.overlay import Overlay, lay_over, overlay_equations
 from umf_ros.core.frames import Frame, Image, Points
 from umf_ros.core.geometry import Array, invert
 from umf_ros.core.trajectory import Trajectory, interpolated
 from umf_ros.embedding.depth import disparities
+from umf_ros.sensors.decode import OdometrySample
 
 SCAN_CELL_M, SCAN_REACH_M = 0.4, 1.0  # by hand: consecutive scans, a quarter of a metre apart
 CELL_MASK = 2**21 - 1  # three coordinates in one number: a scan is far narrower than two million cells
@@ -207,9 +209,8 @@ def _directions(vectors: Array) -> Array:
 MIN_STEP_S, MAX_STEP_S = 0.18, 1.0  # between frames whose motion is compared, by hand
 MAX_STEPS = 150  # by hand: bounds the time
 MOVES_M = 0.03  # by hand: a parked rover says nothing of its clocks
-DEPTH_EVERY, DEPTH_FRAMES, DEPTH_POINTS = 15, 12, 400  # by hand: bounds the time
+DEPTH_EVERY, DEPTH_FRAMES, DEPTH_POINTS = 4, 60, 400  # by hand: bounds the time
 DEPTH_RANGE_M = (2.0, 15.0)  # by hand: where a third of a pixel is a few per cent
-MIN_DEPTHS = 200  # by hand
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +221,7 @@ class SensorReport:
         left_contrast, right_contrast: median standard deviation of an image's grey values.
         returns: median number of a scan's returns.
         intensity_max: largest intensity; NaN where the driver sends none.
-        stereo_scale: median of stereo's depth by the LiDAR's.
+        overlay: baseline, mounting and clock by stereo's points that are laid over the scans.
         lidar, camera: how their motion differs from the odometry's.
         forward: (3,) mean direction of motion by odometry, body axes.
     """
@@ -229,7 +230,7 @@ class SensorReport:
     right_contrast: float = nan
     returns: float = nan
     intensity_max: float = nan
-    stereo_scale: float = nan
+    overlay: Overlay | None = None
     lidar: Disagreement | None = None
     camera: Disagreement | None = None
     forward: Array | None = None
@@ -242,7 +243,7 @@ class SensorCheck:
         self._contrasts: tuple[list[float], list[float]] = [], []
         self._returns: list[float] = []
         self._intensity_max = nan
-        self._depth_ratios: list[Array] = []
+        self._overlaid: list[Array] = []
         self._frames = 0
         self._last: Frame | None = None
         self._scan_steps: list[Step] = []
@@ -253,7 +254,7 @@ class SensorCheck:
         self._frames += 1
         self._look(frame)
         if self._frames % DEPTH_EVERY == 1:
-            self._compare_depths(frame)
+            self.compare_depths(frame)
         waited_s = MIN_STEP_S if self._last is None else (frame.stamp_ns - self._last.stamp_ns) * 1e-9
         if waited_s < MIN_STEP_S:
             return
@@ -263,13 +264,12 @@ class SensorCheck:
 
     def report(self, odometry: Trajectory | None) -> SensorReport:
         """Hold the measurements against the odometry as it was recorded."""
-        ratios = np.concatenate(self._depth_ratios) if self._depth_ratios else np.empty(0)
         left, right, returns = (_median(values) for values in (*self._contrasts, self._returns))
-        scale = float(np.median(ratios)) if len(ratios) >= MIN_DEPTHS else nan
+        found = SensorReport(left, right, returns, self._intensity_max, lay_over(self._overlaid))
         if odometry is None:
-            return SensorReport(left, right, returns, self._intensity_max, scale)
+            return found
         lidar, camera = (compare_motion(steps, odometry) for steps in (self._scan_steps, self._view_steps))
-        return SensorReport(left, right, returns, self._intensity_max, scale, lidar, camera, _forward(odometry))
+        return replace(found, lidar=lidar, camera=camera, forward=_forward(odometry))
 
     def _look(self, frame: Frame) -> None:
         if self._frames % 4 == 1:
@@ -281,9 +281,9 @@ class SensorCheck:
             if frame.intensity is not None and len(frame.intensity):
                 self._intensity_max = float(np.fmax(self._intensity_max, frame.intensity.max()))
 
-    def _compare_depths(self, frame: Frame) -> None:
-        """Stereo's depth by the LiDAR's, where both look."""
-        if frame.left is None or frame.right is None or frame.points is None or len(self._depth_ratios) >= DEPTH_FRAMES:
+    def compare_depths(self, frame: Frame) -> None:
+        """Lay stereo's points over the scan, where both look."""
+        if frame.left is None or frame.right is None or frame.points is None or len(self._overlaid) >= DEPTH_FRAMES:
             return
         camera = frame.camera
         pixels, depth = camera.project(frame.points.astype(float), frame.body_T_camera)
@@ -292,8 +292,9 @@ class SensorCheck:
         chosen = chosen[:: max(1, len(chosen) // DEPTH_POINTS)]
         if len(chosen) and camera.baseline > 0:
             disparity = disparities(frame.left, frame.right, pixels[chosen], camera)
-            ratio = camera.fx * camera.baseline / disparity / depth[chosen]
-            self._depth_ratios.append(ratio[np.isfinite(ratio)])
+            known = np.isfinite(disparity)
+            chosen = chosen[known]
+            self._overlaid.append(overlay_equations(frame, disparity[known], pixels[chosen], chosen))
 
     def _step(self, earlier: Frame, later: Frame) -> None:
         if len(self._scan_steps) + len(self._view_steps) >= 2 * MAX_STEPS:
@@ -307,6 +308,20 @@ class SensorCheck:
         if earlier.image_stamp_ns and later.image_stamp_ns:
             found = view_step(earlier, later)
             self._view_steps += [found] if found else []
+
+
+def check_stream(stream: Iterable[Frame | OdometrySample], odometry: Trajectory | None = None) -> SensorReport:
+    """Check the frames of a recording against its odometry, or against `odometry` where it has none."""
+    check, stamps, poses = SensorCheck(), [-1], list[Array]([np.eye(4)])
+    for item in stream:
+        if isinstance(item, Frame):
+            check.take(item)
+        elif item.stamp_ns > stamps[-1]:  # as far as its stamps grow
+            stamps.append(item.stamp_ns)
+            poses.append(item.odom_T_body)
+    return check.report(
+        Trajectory(np.array(stamps[1:], np.int64), np.stack(poses)[1:]) if len(stamps) > 1 else odometry
+    )
 
 
 def _forward(odometry: Trajectory) -> Array | None:
@@ -333,8 +348,10 @@ LAG_S = 0.1
 """By hand: twice the step that lags are tried in."""
 MOUNTING_DEG = 6.0
 """Measured on simulated drives: right mountings come out within 3.3 deg, the worst about the vertical."""
-SCALE = 0.08
-"""Measured on simulated drives: a right baseline comes out within 1 %."""
+FINE_DEG, FINE_SCALE, FINE_S = 0.5, 0.006, 0.01
+"""Measured on simulated drives: what is right comes out within half of it, where stereo is laid over the scans."""
+SURE = 3.0
+"""Standard deviations, by hand."""
 SAME_DEG = 5.0
 """By hand: two sensors that differ from the odometry alike: it is the odometry."""
 ACROSS = 0.5
@@ -350,12 +367,35 @@ def about_sensors(seen: SensorReport) -> Iterator[Advice]:
         remedy = "--odometry-frame camera, imu or lidar says whose poses the file holds (of the camera z looks ahead)"
         yield Advice("fault", what, remedy)
     known = {name: one for name in _SENSORS if (one := getattr(seen, name)) is not None}
-    yield from _clocks({name: one.lag_s for name, one in known.items()})
-    yield from _mountings({name: one.mounting_deg for name, one in known.items() if one.mounting_deg is not None})
-    if abs(seen.stereo_scale - 1) > SCALE:
-        what = f"stereo sees everything {seen.stereo_scale:.2f} times as far as the LiDAR"
-        remedy = f"baseline of the calibration, or P[3] of the right camera_info: divide by {seen.stereo_scale:.3f}"
-        yield Advice("fault", f"{what}: the baseline is wrong by that factor", remedy)
+    by_motion = [*_clocks({name: one.lag_s for name, one in known.items()})]
+    by_motion += _mountings({name: one.mounting_deg for name, one in known.items() if one.mounting_deg is not None})
+    yield from by_motion
+    if seen.overlay is not None:
+        yield from _overlaid(seen.overlay, bool(by_motion))
+
+
+def _overlaid(overlay: Overlay, is_known: bool) -> Iterator[Advice]:
+    """The error that is largest for what it spoils, as it looks like a little of the others; unless it `is_known`."""
+    turn, scale, units = overlay.turn_deg, overlay.scale, np.array([FINE_DEG, FINE_SCALE, FINE_S])
+    sizes = np.abs(np.array([float(np.linalg.norm(turn)), scale - 1, overlay.lag_s])) / units
+    bounds, worst = SURE * overlay.deviations / units, int(sizes.argmax())
+    seen = "by the ground that both see"
+    if sizes[worst] <= max(bounds[worst], 1):
+        pass
+    elif worst == 1:
+        what = f"stereo sees everything {scale:.3g} times as far as the LiDAR: the baseline is wrong by that factor"
+        remedy = f"baseline of the calibration, or P[3] of the right camera_info: divide by {scale:.3f}"
+        yield Advice("fault", what, remedy)
+    elif worst == 0 and not is_known:
+        what = f"{seen}, LiDAR and camera are mounted otherwise than stated: {_turn(turn)} sets the LiDAR right"
+        yield Advice("warning", what, "body_T_lidar or body_T_camera of the calibration")
+    elif not is_known:
+        what = f"{seen}, the LiDAR's clock is about {-overlay.lag_s:+.3f} s off the camera's"
+        yield Advice("warning", what, "the stamps of their drivers (PTP, or a constant): no parameter corrects them")
+    for bound, name in zip(bounds, ("mounting to 1 deg", "baseline to 1 %", "clock to 20 ms"), strict=True):
+        if bound > 2:
+            what = f"the recording cannot tell the {name}"
+            yield Advice("note", what, "a longer drive past rocks and with turns may")
 
 
 def _measurements(seen: SensorReport) -> Iterator[Advice]:
@@ -401,4 +441,6 @@ def _mountings(known: dict[str, Array]) -> Iterator[Advice]:
 def _turn(mounting_deg: Array) -> str:
     """As "10 deg about y"."""
     axis = int(np.abs(mounting_deg).argmax())
-    return f"{np.linalg.norm(mounting_deg):.0f} deg, mostly about {'xyz'[axis]} ({mounting_deg[axis]:+.0f} deg)"
+    digits = 0 if np.linalg.norm(mounting_deg) > SAME_DEG else 1
+    size, along = np.linalg.norm(mounting_deg), mounting_deg[axis]
+    return f"{size:.{digits}f} deg, mostly about {'xyz'[axis]} ({along:+.{digits}f} deg)"

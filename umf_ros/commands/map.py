@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from umf_ros.commands.recordings import (
     ConfigPath,
@@ -18,6 +19,7 @@ from umf_ros.commands.recordings import (
     check_files,
     check_odometry_options,
 )
+from umf_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,6 +39,24 @@ OdometryFolder = Annotated[
 ]
 
 
+Pair = Annotated[
+    tuple[int, int] | None, typer.Option(metavar="MATCH QUERY", help="Closure by the stamps of its keyframes.")
+]
+
+
+class _MakeOrChange(TyperGroup):
+    """`umf map RECORDINGS` makes a map; `umf map edit` and `umf map grow` are the commands beside that."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Name the usual command where none is named."""
+        return super().parse_args(ctx, args if args[:1] in (["edit"], ["grow"]) else ["make", *args])
+
+
+ALSO = "umf map edit decides about closures of a map by hand, umf map grow adds a drive that localised in it."
+app = typer.Typer(cls=_MakeOrChange, rich_markup_mode="rich")
+
+
+@app.command("make", epilog=ALSO)
 def command(
     recordings: Recordings,
     out: MapPath = Path("map"),
@@ -85,8 +105,63 @@ def command(
     _print_summary(out, summary, console)
 
 
+@app.command("edit")
+def edit(
+    map_folder: Annotated[Path, typer.Argument(help="Folder of the map.")],
+    reject: Pair = None,
+    accept: Pair = None,
+    undo: Pair = None,
+) -> None:
+    """Decide about closures of a map by hand, and solve it again.
+
+    MATCH and QUERY are stamps in nanoseconds, as in graph_verdicts.csv of the map. The decisions are kept in edits.json
+    of the map until --undo leaves a closure to the evidence again.
+    """
+    from rich.console import Console
+
+    from umf_ros.core.frames import State
+    from umf_ros.maps.joint_graph import solve
+    from umf_ros.maps.map_folder import MapFolder
+    from umf_ros.maps.outputs import write_results
+
+    target = MapFolder.open(map_folder)
+    edits = target.edits()
+    edits |= {pair: state for pair, state in ((reject, State.REJECTED), (accept, State.ACCEPTED)) if pair}
+    if undo and edits.pop(undo, None) is None:
+        raise ConfigError(f"--undo {undo[0]} {undo[1]}: nothing was decided about that closure by hand")
+    console = Console()
+    with console.status("Solving the joint graph"):
+        joint = solve(target, edits)  # an edit that cannot be leaves all as it is
+        target.write_edits(edits)
+        summary = write_results(target, joint)
+    for (match, query), state in edits.items():
+        console.print(f"  {match} {query}: {state.value} by hand", markup=False, soft_wrap=True)
+    _print_summary(map_folder, summary, console)
+
+
+@app.command("grow")
+def grow_map(
+    map_folder: Annotated[Path, typer.Argument(help="Folder of the map.")],
+    run: Annotated[Path, typer.Argument(help="Run folder of a drive that localised in it with localization.update.")],
+) -> None:
+    """Make what a rover saw while localising in a map a session of that map.
+
+    The nodes do so themselves at ~/save and at the end; this is for a run that was killed.
+    """
+    from rich.console import Console
+
+    from umf_ros.maps.growth import grow
+
+    console = Console()
+    with console.status("Solving the joint graph"):
+        session, summary = grow(map_folder, run)
+    if session is None:
+        console.print(f"{run}: nothing new for the map", markup=False, soft_wrap=True)
+    _print_summary(map_folder, summary, console)
+
+
 def _new_recordings(target: MapFolder, recordings: list[Path], console: Console) -> dict[str, Path]:
-    """Return the recordings that are not in the map yet, by the names of their future sessions."""
+    """The recordings that are not in the map yet, by the names of their sessions to be."""
     from umf_ros.bags.reader import open_bag
     from umf_ros.runs.reader import describe_recording
 

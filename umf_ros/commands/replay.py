@@ -29,6 +29,7 @@ from umf_ros.core.errors import ConfigError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from umf_ros.core.config import Settings
     from umf_ros.localizer import Localization
 
 MinProbability = Annotated[
@@ -94,6 +95,7 @@ def command(
         mode=mode or ("localization" if map_folder else None),
         map=str(map_folder) if map_folder else None,
     )
+    _tell_inputs(console, settings)
     warnings: list[str] = []
     reader = open_frames(recording, settings, partial(_warn, console, warnings), odometry, odometry_frame)
     read_ground_truth(None, ground_truth)  # reports its errors before the run
@@ -101,8 +103,9 @@ def command(
         raise ConfigError("--rerun is for mapping runs: leave it out with --map")
     network = make_detector_embedder(settings)
     viewer = RerunLog(rerun) if rerun else None
-    # an unusable database or map is reported before the folder is made
-    detector = LoopDetector(settings, network) if settings.database.path or settings.localizing else None
+    # a store or a map that cannot be used is reported before there is a folder
+    known = settings.database.path or (settings.localizing and not settings.grows_map)
+    detector = LoopDetector(settings, network) if known else None
     unfinished = unfinished_folder(out, bag, settings) if resume and not settings.localizing else None
     folder = unfinished or create_folder(out, bag)
     detector = detector or LoopDetector(with_places(settings, folder), network)
@@ -124,6 +127,7 @@ def command(
     with undisturbed():
         replay.finish(count_drops(reader.counters))
         if not interrupted() or settings.localizing:
+            _grow(console, settings, folder)
             finish_folder(folder)
         if viewer:
             viewer.finish(folder)
@@ -142,6 +146,27 @@ def command(
             status = finish_run(folder, recording, console, ground_truth, shown, replay.sensor_check).exit_code
     replay.raise_if_frames_failed()
     raise typer.Exit(status)
+
+
+def _tell_inputs(console: Console, settings: Settings) -> None:
+    """Print which inputs were found where no parameter and no data set names them."""
+    from umf_ros.core.config import TRANSFORMS
+    from umf_ros.sensors.topic_finder import describe_inputs
+
+    if settings.calibration == TRANSFORMS:
+        console.print(describe_inputs(settings), markup=False, highlight=False, soft_wrap=True)
+
+
+def _grow(console: Console, settings: Settings, folder: Path) -> None:
+    """Make what was seen while localising a session of the map, where that is asked for."""
+    if not settings.grows_map:
+        return
+    from umf_ros.maps.growth import grow
+    from umf_ros.maps.outputs import sentence
+
+    session, summary = grow(Path(settings.map), folder)
+    told = "nothing new for the map" if session is None else f"session {session.name}: {sentence(summary)}"
+    console.print(f"{settings.map}: {told}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _warn(console: Console, warnings: list[str], text: str) -> None:

@@ -38,6 +38,8 @@ def without_password(address: str) -> str:
     return address
 
 
+TRANSFORMS = "tf"
+"""Calibration in place of a file: `/tf_static` and camera_info say how the rig is built, or its messages wait."""
 Dataset = Annotated[str, AfterValidator(_known)]
 """Name of a data set that has a file in `config/datasets`."""
 
@@ -190,6 +192,14 @@ class PoseGraphSettings(Group):
     )
 
 
+class LocalizationSettings(Group):
+    """Use of a drive that localised in a map."""
+
+    update: bool = Field(
+        False, description="it becomes a session of the map at ~/save and at the end; needs a folder of results"
+    )
+
+
 class FrameIds(Group):
     """Names of the coordinate frames (REP-105)."""
 
@@ -233,11 +243,14 @@ class Settings(Group):
     dataset: Dataset = Field(
         DEFAULT_DATASET, description="preset of calibration and topics, a file in `config/datasets` by its name"
     )
-    calibration: str = Field("", description="calibration file (YAML); empty: the data set's")
+    calibration: str = Field(
+        "", description="calibration file (YAML); tf: /tf_static and camera_info alone; empty: the data set's"
+    )
     mode: Literal["mapping", "localization"] = Field(
         "mapping", description="mapping: add places; localization: localise in the map that `map` names"
     )
-    map: str = Field("", description="folder of a map made by `umf map`, for mode localization; read only")
+    map: str = Field("", description="folder of a map that `umf map` made, for mode localization")
+    localization: LocalizationSettings = LocalizationSettings()
     topics: Topics = Topics()
     absolute: AbsoluteTopics = AbsoluteTopics()
     qos: Qos = Qos()
@@ -263,8 +276,15 @@ class Settings(Group):
         return self.mode == "localization"
 
     @property
+    def grows_map(self) -> bool:
+        """Whether what is seen while localising becomes a part of the map."""
+        return self.localizing and self.localization.update
+
+    @property
     def uses_transforms(self) -> bool:
-        """Whether extrinsics come from `/tf_static`; a named data set keeps its own calibration."""
+        """Whether `/tf_static` says where the sensors are: a data set that was chosen has a calibration of its own."""
+        if self.calibration == TRANSFORMS:
+            return True
         return self.frames.extrinsics == "tf" and self.dataset == DEFAULT_DATASET
 
 

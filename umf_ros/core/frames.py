@@ -198,8 +198,6 @@ class Candidate:
         inliers_image: pairs of image features that one homography explains; NaN before the reranking.
         inliers_cloud: pairs of the scan's features that one rigid motion explains; NaN before the reranking.
         superfeatures: eligible pairs of super-features of both modalities; NaN before the reranking.
-        image_pairs: (P, 2) mutual neighbours among the image features (query, match).
-        cloud_pairs: (P, 2) mutual neighbours among the scan's features (query, match).
         score: of the reranking, larger is better.
     """
 
@@ -209,8 +207,6 @@ class Candidate:
     inliers_image: float = math.nan
     inliers_cloud: float = math.nan
     superfeatures: float = math.nan
-    image_pairs: NDArray[np.intp] = field(default_factory=lambda: np.empty((0, 2), np.intp), compare=False, repr=False)
-    cloud_pairs: NDArray[np.intp] = field(default_factory=lambda: np.empty((0, 2), np.intp), compare=False, repr=False)
     score: float = 0.0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,14 +60,15 @@ class JointMap:
         return [verdict.closure for verdict in self.between if verdict.state is State.ACCEPTED]
 
 
-def solve(folder: MapFolder) -> JointMap:
+def solve(folder: MapFolder, edits: Mapping[tuple[int, int], State] | None = None) -> JointMap:
     """Build and settle the joint graph of a map from the run folders of its sessions.
 
     The same outlier rejection applies to closures within and between recordings: two unconnected sessions are joined
-    once closures of several places are consistent with each other.
+    once closures of several places are consistent with each other. Decisions by hand, `edits` or else those of the
+    folder, go before.
 
     Raises:
-        UmfError: a file of the map is missing or damaged.
+        UmfError: a file of the map is missing or damaged, or an edit is about no closure of the map.
     """
     graph = PoseGraph(folder.settings.pose_graph)
     odometry = {session.name: folder.odometry_of(session.name) for session in folder.sessions}
@@ -79,6 +81,8 @@ def solve(folder: MapFolder) -> JointMap:
         run = folder.folder_of(session.name)
         within = [_shifted(one, session.shift_ns) for one in read_closures(run / "closures.csv")]
         graph.add_closures(within + read_closures(run / BETWEEN))
+    for pair, state in (folder.edits() if edits is None else edits).items():
+        graph.decide_by_hand(*pair, state)
     graph.settle()
     verdicts: tuple[list[ClosureVerdict], list[ClosureVerdict]] = ([], [])
     for verdict in graph.closures():

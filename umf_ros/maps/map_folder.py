@@ -6,7 +6,7 @@ A map that is missing or damaged raises an `UmfError`, a folder that cannot be w
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,12 +14,13 @@ from typing import Any
 
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.frames import State
 from umf_ros.core.io import write_atomically
 from umf_ros.places.database import PLACES_OF_MAP
 from umf_ros.runs.run_file import RunFile, StoredOdometry
 
 SCHEMA_VERSION = 1
-BETWEEN = "closures_between.csv"
+BETWEEN, EDITS = "closures_between.csv", "edits.json"
 _DAY_NS = 86_400 * 10**9
 APART_NS = 60 * 10**9
 """Least gap between sessions on the map's clock: longer than any interpolated gap of odometry."""
@@ -136,6 +137,21 @@ class MapFolder:
         newest = max((session.last_ns + session.shift_ns for session in self.sessions), default=None)
         missing = 0 if newest is None else newest + APART_NS - first_ns
         return 0 if missing <= 0 else -(-missing // _DAY_NS) * _DAY_NS
+
+    def edits(self) -> dict[tuple[int, int], State]:
+        """Decisions by hand about closures, by the stamps of match and query on the map's clock."""
+        if not (self.path / EDITS).is_file():
+            return {}
+        try:
+            rows = json.loads((self.path / EDITS).read_text(encoding="utf-8"))
+            return {(int(row["match"]), int(row["query"])): State(row["decision"]) for row in rows}
+        except (OSError, ValueError, KeyError, TypeError):
+            raise UmfError(f"{self.path / EDITS} is damaged") from None
+
+    def write_edits(self, edits: Mapping[tuple[int, int], State]) -> None:
+        """Replace the decisions by hand."""
+        rows = [{"match": match, "query": query, "decision": state} for (match, query), state in edits.items()]
+        write_atomically(self.path / EDITS, json.dumps(rows, indent=1) + "\n")
 
     def add(self, session: MapSession) -> None:
         """Add a session whose places are in the place database."""

@@ -180,21 +180,45 @@ def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
     """
     run = target.folder_of(name)
     bag = open_bag(recording)
+    with closing(open_places(run / PLACES)) as own:
+        known = (own[row] for row in range(len(own)))
+        session = add_places(target, name, known, stored_identity(run / PLACES), describe_recording(bag))
+    with writing(run):
+        for path in run.glob(f"{PLACES}*"):
+            path.unlink()
+    return session
+
+
+def add_places(
+    target: MapFolder,
+    name: str,
+    known: Iterable[Keyframe],
+    identity: tuple[str, int],
+    recording: dict[str, Any],
+) -> MapSession:
+    """Add places of a session to the map's store, on the map's clock; `map.json`, written last, makes them its own.
+
+    Args:
+        target: the map; the run folder of the session holds its odometry.
+        name: of the session.
+        known: its places, on its own clock.
+        identity: embedder of the places, and numbers per descriptor.
+        recording: its description.
+    """
     _discard_unfinished(target)
-    with closing(PlaceDatabase(Database(path=str(target.places)), *stored_identity(run / PLACES))) as places:
+    with closing(PlaceDatabase(Database(path=str(target.places)), *identity)) as places:
         first_place, first_number = len(places), places.next_session
-        with closing(open_places(run / PLACES)) as own:
-            known = [own[row] for row in range(len(own))]
-            stamps = [keyframe.stamp_ns for keyframe in known] or [bag.start_ns]
-            odometry = target.odometry_of(name)
-            span = [*stamps, *(one.stamp_ns for one in odometry)]
-            shift_ns = target.shift_for(min(span))
-            for one in known:
-                stamp_ns, number = one.stamp_ns + shift_ns, one.session + first_number
-                places.add(replace(one, stamp_ns=stamp_ns, session=number))
+        odometry = target.odometry_of(name)
+        known = list(known)
+        stamps = [keyframe.stamp_ns for keyframe in known] or [recording["start_ns"]]
+        span = [*stamps, *(one.stamp_ns for one in odometry)]
+        shift_ns = target.shift_for(min(span))
+        for one in known:
+            stamp_ns, number = one.stamp_ns + shift_ns, one.session + first_number
+            places.add(replace(one, stamp_ns=stamp_ns, session=number))
         session = MapSession(
             name=name,
-            recording=describe_recording(bag),
+            recording=recording,
             shift_ns=shift_ns,
             first_ns=min(span),
             last_ns=max(span),
@@ -205,9 +229,6 @@ def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
             odometry=not odometry or odometry[0].covariance is None,
         )
     target.add(session)
-    with writing(run):
-        for path in run.glob(f"{PLACES}*"):
-            path.unlink()
     return session
 
 

@@ -19,8 +19,7 @@ from umf_ros.localizer import POSES
 from umf_ros.maps.joint_graph import JointMap, JointSession
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.point_cloud import write_cloud
-from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.g2o import verdict_table
+from umf_ros.pose_graph.closures import State, verdict_table
 from umf_ros.runs.gallery import data_address
 from umf_ros.runs.report import plot_trajectories, render
 

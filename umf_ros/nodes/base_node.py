@@ -7,28 +7,33 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from rclpy.task import Future
+from std_srvs.srv import Trigger
 
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics
-from umf_ros.core.errors import MessageError, OutputError, UmfError
+from umf_ros.core.errors import ConfigError, MessageError, OutputError, UmfError, either
 from umf_ros.core.io import check_writable
 from umf_ros.nodes.conversions import from_time, latched
 from umf_ros.nodes.diagnostics import WARN, InputWatch
 from umf_ros.nodes.parameters import changed_settings, declare
+from umf_ros.nodes.process import Worker
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.tf import PATIENCE_S, TOPIC, BodyFrames, StaticTransforms
+from umf_ros.sensors.topic_finder import FRONT_END, SETTLING_S, TopicFinder, describe_inputs, must_find
 
 STATIC_QOS = latched(100)
 """Deep enough for several broadcasters, each with a part of the tree."""
@@ -43,8 +48,10 @@ class BaseNode(LifecycleNode, ABC):
     """A managed node with the package's settings as its parameters, and a folder for results.
 
     Nodes set up their work in `_open` and end it in `_finish`. With `autostart`, the default, they are configured and
-    activated at once; without, they wait for the services of the life cycle. An inactive node takes no messages.
-    No exception in a callback ends a node: each is counted, logged, and reported in the diagnostics.
+    activated at once, or when the topics that no parameter names are found in the ROS graph; without, they wait for the
+    services of the life cycle. An inactive node takes no messages.
+    No exception in a callback ends a node: every one is counted, logged, and shows in the diagnostics. `failure` is why
+    a node cannot start.
 
     Raises:
         ConfigError: a parameter is unknown, of the wrong type or out of range.
@@ -52,10 +59,15 @@ class BaseNode(LifecycleNode, ABC):
         UmfError: it cannot be configured, with `autostart`.
     """
 
-    def __init__(self, name: str, results: str) -> None:
-        """Declare the parameters; `results` describes the folder `results_dir`."""
+    def __init__(self, name: str, results: str, wanted: Collection[str] = FRONT_END) -> None:
+        """Declare the parameters; `results` describes the folder `results_dir`, `wanted` are inputs."""
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
         self._settings, self._results = declare(self, results)
+        self._input_names, self._finder = wanted, None
+        if must_find(self._settings, wanted):
+            self._check_results()  # before it waits for topics
+            self._finder = TopicFinder(self._settings, self.get_namespace(), wanted)
+        self.failure: UmfError | None = None
         self._watches: list[InputWatch] = []
         self._own: list[Any] = []
         self._faults, self._last_fault = Counter[str](), ""
@@ -71,16 +83,40 @@ class BaseNode(LifecycleNode, ABC):
         self._stall_ms, self._beat_s = 0.0, math.inf
         self.create_timer(HEARTBEAT_S, self._beat, clock=self._wall)
         self.create_timer(WATCH_S, self._guarded("watch", lambda: self._watch()), clock=self._wall)
-        if self.get_parameter("autostart").value:
-            self._configure()
-            self.trigger_configure()
-            self.trigger_activate()
-            self.get_logger().info("ready")
+        self._starting = bool(self.get_parameter("autostart").value)
+        if self._starting:
+            self._start()
+
+    def _start(self) -> None:
+        """Configure and activate, as soon as the inputs are found."""
+        if not self._find_inputs(SETTLING_S):
+            if self._is_due("inputs", 30.0):
+                wanted = either(list(self._input_names))
+                self.get_logger().info(f"waiting for topics of {wanted} (parameters topics.*, dataset)")
+            return
+        self._starting = False
+        self._configure()
+        self.trigger_configure()
+        self.trigger_activate()
+        self.get_logger().info("ready")
+
+    def _find_inputs(self, settling_s: float) -> bool:
+        """Name the topics that no parameter names; False while they are not there."""
+        if self._finder is None:
+            return True
+        types = {topic: kinds[0] for topic, kinds in self.get_topic_names_and_types() if self.count_publishers(topic)}
+        found = self._finder.look(types, time.monotonic(), settling_s)
+        if found is not None:
+            self._settings, self._finder = found, None
+            self.get_logger().info(describe_inputs(found, self._input_names))
+        return found is not None
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Configure the node; an error of the user is one line and a failure."""
         if not self._opened:
             try:
+                if not self._find_inputs(0.0):
+                    raise ConfigError("no topic of its inputs is there (parameters topics.*, dataset)")
                 self._configure()
             except UmfError as error:
                 self.get_logger().error(str(error))
@@ -158,8 +194,7 @@ class BaseNode(LifecycleNode, ABC):
         """Work once per second of the machine's clock."""
 
     def _configure(self) -> None:
-        if self._results:
-            check_writable(Path(self._results))
+        self._check_results()
         before, self._unwritten = self._entities(), None
         try:
             with watchdog.watching(watchdog.PATIENT_S):
@@ -170,6 +205,10 @@ class BaseNode(LifecycleNode, ABC):
             gc.freeze()
         finally:
             self._own = [item for item in self._entities() if item not in before]
+
+    def _check_results(self) -> None:
+        if self._results:
+            check_writable(Path(self._results))
 
     def _entities(self) -> list[Any]:
         return [*self.publishers, *self.subscriptions, *self.services]
@@ -183,6 +222,11 @@ class BaseNode(LifecycleNode, ABC):
         self._watches.clear()
 
     def _watch(self) -> None:
+        if self._starting:
+            try:
+                self._start()
+            except UmfError as error:
+                self.failure, self._starting = error, False
         if not self._opened:
             return
         self._clockless_s = self._clockless_s + WATCH_S if self._lacks_clock() else 0.0
@@ -259,6 +303,9 @@ class BaseNode(LifecycleNode, ABC):
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError:
+            if calibration is not None and calibration.is_open:
+                text = f"{TOPIC} cannot be heard without tf2_msgs: the parameter calibration names a file"
+                raise ConfigError(text) from None
             if self._settings.frames.extrinsics == "tf":
                 self.get_logger().info("tf2_msgs is not installed: extrinsics are those of the calibration file")
         else:
@@ -278,6 +325,29 @@ class BaseNode(LifecycleNode, ABC):
             return response
 
         self.create_service(kind, name, answer)
+
+    def _offer_in_turn(
+        self, worker: Worker[Callable[[], None]], name: str, action: Callable[[Any], str], kind: type = Trigger
+    ) -> None:
+        """Offer a service whose action a worker does when it is its turn: the executor goes on meanwhile."""
+
+        def act(request: Any, answered: Future) -> None:
+            try:
+                with watchdog.task(name, watchdog.PATIENT_S):
+                    answered.set_result((True, action(request)))
+            except Exception as error:
+                if not isinstance(error, UmfError):
+                    self._report_fault(error, name)
+                answered.set_result((False, str(error)))
+
+        async def answer(request: Any, response: Any) -> Any:
+            answered = Future()
+            worker.submit(lambda: act(request, answered))
+            response.success, response.message = await answered
+            return response
+
+        # a group of its own: those in one group wait for each other, the timers too
+        self.create_service(kind, name, answer, callback_group=ReentrantCallbackGroup())
 
     def _diagnose(self, own: DiagnosticStatus) -> None:
         """Publish the health of the node and its inputs."""

@@ -18,7 +18,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from umf_ros.core.config import FrameIds, Qos
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import LoopClosure
-from umf_ros.core.geometry import Array, to_quaternion
+from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose
 
 
@@ -136,6 +136,30 @@ def closure_from_message(message: Odometry) -> LoopClosure:
     )
 
 
+def closure_by_hand(text: str) -> tuple[str, LoopClosure | None]:
+    """The pair of keyframes in a text as of `parse_pair`, and the closure where nine numbers follow.
+
+    These are x y z (m) and quaternion x y z w of `match_T_query`, and standard deviations in m and in deg.
+
+    Raises:
+        MessageError: of kind "reject_edge" or "add_closure": it is something else.
+    """
+    words = text.split() if len(text) < 500 else []
+    pair, numbers = " ".join(words[:2]), words[2:]
+    match, query = parse_pair(pair)
+    if not numbers:
+        return pair, None
+    try:
+        x, y, z, *turn, sigma_m, sigma_deg = (float(number) for number in numbers)
+        pose = from_quaternion((x, y, z), turn)
+        if len(numbers) != 9 or not (0 < sigma_m < math.inf and 0 < sigma_deg < math.inf):
+            raise ValueError("expected x y z qx qy qz qw and two standard deviations, m and deg")
+    except ValueError as error:
+        raise MessageError("add_closure", f"{' '.join(numbers)[:80]!r} is no pose: {error}") from None
+    covariance = np.diag([sigma_m**2] * 3 + [math.radians(sigma_deg) ** 2] * 3)
+    return pair, LoopClosure(query, match, pose, covariance, math.nan)
+
+
 def parse_pair(text: str) -> tuple[int, int]:
     """Return stamps of match and query in `keyframe/<match ns> keyframe/<query ns>`.
 
@@ -146,7 +170,7 @@ def parse_pair(text: str) -> tuple[int, int]:
     stamps = [stamp for stamp in map(_stamp_in, frames) if stamp is not None]
     if len(frames) != 2 or len(stamps) != 2:
         expected = "expected 'keyframe/<match ns> keyframe/<query ns>'"
-        raise MessageError("reject_edge", f"{text[:80]!r} on ~/reject_edge, {expected}")
+        raise MessageError("reject_edge", f"{text[:80]!r} is no pair of keyframes, {expected}")
     return stamps[0], stamps[1]
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +23,7 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from umf_ros.core.config import FrameIds, Settings, topics_of
+from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line
 from umf_ros.core.frames import Frame, Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, rotation_angle
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
@@ -38,7 +42,7 @@ from umf_ros.nodes.conversions import (
 )
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
 from umf_ros.nodes.process import Worker, leave, run
-from umf_ros.runs.writer import RunRecorder, count_drops
+from umf_ros.runs.writer import RunRecorder, count_drops, with_places
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
@@ -49,6 +53,8 @@ if TYPE_CHECKING:
 
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
 INTAKE_QUEUE = 400
+ADDING_S = 50.0
+"""So long a map may take to grow: at the end, launch waits ten seconds more than that."""
 MESSAGE_TYPES = {"cloud": PointCloud2, "odometry": Odometry}
 MESSAGE_TYPES |= dict.fromkeys(("left_image", "right_image"), Image)
 MESSAGE_TYPES |= dict.fromkeys(("left_info", "right_info"), CameraInfo)
@@ -66,6 +72,10 @@ class LoopClosureNode(BaseNode):
 
     def _open(self) -> None:
         settings, warn = self._settings, self.get_logger().warning
+        if settings.grows_map:
+            if not self._results:
+                raise ConfigError("localization.update needs results_dir, where the rover's places are kept")
+            settings = with_places(settings, Path(self._results))
         embedder = make_detector_embedder(settings)
         calibration, topics = calibration_of(settings), topics_of(settings)
         self._detector = LoopDetector(settings, embedder)
@@ -87,7 +97,11 @@ class LoopClosureNode(BaseNode):
                 take = partial(self._enqueue, topic)
                 qos = sensor_qos(settings.qos)
                 self._subscribe(name, MESSAGE_TYPES[name], self._own_topic(name, topics), take, qos)
-        self._offer(Trigger, "~/save", self._save)
+        if settings.grows_map:
+            self._adder: Worker[Callable[[], None]] = Worker(lambda step: step(), self._report_fault, 1)
+            self._offer_in_turn(self._adder, "~/save", lambda _: self._grow())
+        else:
+            self._offer(Trigger, "~/save", self._save)
         self._offer(Trigger, "~/reset", self._reset)
         self._offer(SetBool, "~/pause", self._pause)
 
@@ -105,6 +119,17 @@ class LoopClosureNode(BaseNode):
                 self._recorder.close()
         finally:
             self._detector.close()
+        if self._settings.grows_map:
+            self._adder.close(timeout_s=ADDING_S)
+            self.get_logger().info(self._grow())
+
+    def _grow(self) -> str:
+        """Add what was seen to the map, in a process of its own: its libraries are none of this node's."""
+        command = [sys.executable, "-m", "umf_ros.cli", "map", "grow", self._settings.map, self._results]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=ADDING_S)
+        if done.returncode:
+            raise OutputError(f"{self._settings.map} stays as it was: {one_line(UmfError(done.stderr))}")
+        return " ".join(done.stdout.split())
 
     def _retune(self, settings: Settings) -> None:
         self._wanted = settings  # the executor must not wait for the current keyframe

@@ -11,22 +11,21 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.srv import AddDiagnostics
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from lifecycle_msgs.msg import TransitionEvent
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.task import Future
 from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from umf_ros.absolute.measurement import AbsoluteDecoder, Aid
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, topics_of
 from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.durable_graph import JOURNAL, DurableGraph
 from umf_ros.localizer import MapFollower
@@ -35,6 +34,7 @@ from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import (
     CLOSURES_QOS,
     LATCHED_QOS,
+    closure_by_hand,
     closure_from_message,
     is_between_rovers,
     parse_pair,
@@ -43,8 +43,9 @@ from umf_ros.nodes.conversions import (
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.pose_graph.closures import ClosureVerdict, State
-from umf_ros.sensors.calibration import calibration_of
+from umf_ros.sensors.calibration import Calibration, calibration_of
 from umf_ros.sensors.decode import OdometrySample, decode_odometry, stamp_ns
+from umf_ros.sensors.topic_finder import BACK_END
 
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: none is lost while the optimiser works
@@ -65,7 +66,7 @@ class PoseGraphNode(BaseNode):
     def __init__(self) -> None:
         self._front_end_busy = False
         self._interrupted_s: float | None = None
-        super().__init__("pose_graph_node", "folder for trajectories, graph and verdicts; empty: none")
+        super().__init__("pose_graph_node", "folder for trajectories, graph and verdicts; empty: none", BACK_END)
 
     def _open(self) -> None:
         settings = self._settings
@@ -89,18 +90,28 @@ class PoseGraphNode(BaseNode):
         if self._durable.unsettled:
             self._worker.submit(lambda: self._settle_previous())
         topics = topics_of(settings)
-        self._odometry_frames = self._subscribe_transforms()
+        is_aided = bool(settings.absolute.gnss or settings.absolute.imu)
+        calibration = calibration_of(settings) if is_aided else None
+        self._odometry_frames = self._subscribe_transforms(calibration)
         if topics.odometry:
             qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
             self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
         self._subscribe("closures", Odometry, "loop_closures", self._on_closure, CLOSURES_QOS, rare=True)
-        self._subscribe_absolute()
+        if calibration is not None:
+            self._subscribe_absolute(calibration)
         self.create_subscription(String, "~/reject_edge", self._guarded("reject_edge", self._on_reject), 10)
-        handler = self._guarded("front-end", self._on_front_end)
-        self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", handler, 10)
-        self._offer_in_turn("~/reject_last", self._reject_last)
-        self._offer_in_turn("~/save", self._save)
-        self._offer_in_turn("~/reset", self._reset)
+        hear = self._guarded("front-end", self._on_front_end)
+        self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", hear, 10)
+        self._offer_in_turn(self._worker, "~/reject_last", lambda _: self._reject_last())
+        self._offer_in_turn(self._worker, "~/save", lambda _: self._save())
+        self._offer_in_turn(self._worker, "~/reset", lambda _: self._reset())
+        self._offer_in_turn(self._worker, "~/add_closure", self._add_by_hand, AddDiagnostics)
+        self._offer_in_turn(
+            self._worker, "~/reject_edge", partial(self._decide_by_hand, state=State.REJECTED), AddDiagnostics
+        )
+        self._offer_in_turn(
+            self._worker, "~/undo_edit", partial(self._decide_by_hand, state=State.PENDING), AddDiagnostics
+        )
 
     def _finish(self) -> None:
         """Process the queue, settle the graph and write the results."""
@@ -129,37 +140,14 @@ class PoseGraphNode(BaseNode):
     def _retune(self, settings: Settings) -> None:
         self._worker.submit(lambda: self._durable.graph.retune(settings.pose_graph))
 
-    def _offer_in_turn(self, name: str, action: Callable[[], str]) -> None:
-        """Offer a service whose action is queued for the worker; poses are published meanwhile."""
-
-        def act(answered: Future) -> None:
-            try:
-                with watchdog.task(name, watchdog.PATIENT_S):
-                    answered.set_result((True, action()))
-            except Exception as error:
-                if not isinstance(error, UmfError):
-                    self._report_fault(error, name)
-                answered.set_result((False, str(error)))
-
-        async def answer(_: Any, response: Any) -> Any:
-            answered = Future()
-            self._worker.submit(lambda: act(answered))
-            response.success, response.message = await answered
-            return response
-
-        # a group of its own: callbacks in one group, and timers, wait for each other
-        self.create_service(Trigger, name, answer, callback_group=ReentrantCallbackGroup())
-
     def _on_front_end(self, event: TransitionEvent) -> None:
         self._front_end_busy = event.goal_state.label == "shuttingdown"
 
-    def _subscribe_absolute(self) -> None:
-        """Subscribe to GNSS and IMU where their topics are named."""
+    def _subscribe_absolute(self, calibration: Calibration) -> None:
+        """Hear GNSS and IMU where their topics are named."""
         topics, qos = self._settings.absolute, sensor_qos(self._settings.qos, ODOMETRY_DEPTH)
-        if not topics.gnss and not topics.imu:
-            return
-        calibration = calibration_of(self._settings)
-        self._decoder = AbsoluteDecoder(calibration.antenna, calibration.body_T_imu, self._odometry_frames.pose_of)
+        find = self._odometry_frames.pose_of
+        self._decoder = AbsoluteDecoder(calibration.antenna, calibration.body_T_imu, find)
         if topics.gnss:
             self._subscribe("gnss", NavSatFix, topics.gnss, partial(self._on_absolute, Aid.GNSS), qos)
         if topics.imu:
@@ -202,8 +190,8 @@ class PoseGraphNode(BaseNode):
         self._worker.submit(lambda: self._announce(self._durable.add_closure(closure)))
 
     def _on_reject(self, message: String) -> None:
-        match, query = parse_pair(message.data)
-        self._worker.submit(lambda: self._announce(self._durable.revoke(match, query)))
+        pair = parse_pair(message.data)
+        self._worker.submit(lambda: self._announce(self._durable.decide_by_hand(*pair, State.REJECTED)))
 
     def _add_odometry(self, sample: OdometrySample) -> None:
         reset = self._durable.take_odometry(sample.stamp_ns, sample.odom_T_body)
@@ -285,8 +273,23 @@ class PoseGraphNode(BaseNode):
         accepted = [v.closure for v in self._durable.graph.closures() if v.state is State.ACCEPTED]
         if not accepted:
             raise UmfError("no closure is accepted")
-        self._announce(self._durable.revoke(accepted[-1].match_stamp_ns, accepted[-1].query_stamp_ns))
-        return f"closure {_name(accepted[-1])} revoked"
+        last = accepted[-1]
+        self._announce(self._durable.decide_by_hand(last.match_stamp_ns, last.query_stamp_ns, State.REJECTED))
+        return f"closure {_name(last)} revoked"
+
+    def _decide_by_hand(self, request: AddDiagnostics.Request, state: State) -> str:
+        """Decide about the closures between two keyframes that the request's text names."""
+        pair = parse_pair(request.load_namespace)
+        self._announce(self._durable.decide_by_hand(*pair, state))
+        told = [verdict for verdict in self._durable.graph.closures() if _ends(verdict.closure) == pair]
+        return "; ".join(f"closure {_name(one.closure)} {one.state.value}: {one.reason}" for one in told)
+
+    def _add_by_hand(self, request: AddDiagnostics.Request) -> str:
+        """Accept the closures between two keyframes; with a pose in the request, that is a new one."""
+        pair, closure = closure_by_hand(request.load_namespace)
+        if closure is not None:
+            self._announce(self._durable.add_closure(closure))
+        return self._decide_by_hand(AddDiagnostics.Request(load_namespace=pair), State.ACCEPTED)
 
     def _save(self) -> str:
         folder = self._results or "pose_graph_results"
@@ -323,6 +326,10 @@ def _as_status(verdict: ClosureVerdict) -> DiagnosticStatus:
     level = OK if verdict.state is State.ACCEPTED else WARN
     values = {"verdict": verdict.state.value, "mahalanobis": verdict.residual, "misfit_m": verdict.residual_m}
     return status(level, _name(verdict.closure), verdict.reason, values)
+
+
+def _ends(closure: LoopClosure) -> tuple[int, int]:
+    return closure.match_stamp_ns, closure.query_stamp_ns
 
 
 def _name(closure: Any) -> str:

@@ -122,9 +122,14 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
         with watchdog.watching():
             while not signals and rclpy.ok():
                 _spin_once(node, executor, 0.2)
+                failure: UmfError | None = getattr(node, "failure", None)
+                if failure is not None:
+                    complain(failure)
+                    status = 1
+                    break
             ready: Callable[[], bool] = getattr(node, "ready_to_close", lambda: True)
             deadline, first = time.monotonic() + LONGEST_WAIT_S, len(signals)
-            while not ready() and len(signals) == first and time.monotonic() < deadline and rclpy.ok():
+            while not (status or ready()) and len(signals) == first and time.monotonic() < deadline and rclpy.ok():
                 _spin_once(node, executor, 0.05)
     except ExternalShutdownException:
         pass

@@ -17,6 +17,7 @@ from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError, writing
 from umf_ros.core.frames import LoopClosure
+from umf_ros.core.g2o import write_g2o
 from umf_ros.core.geometry import Array, gtsam_to_ros_covariance, invert
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.pose_graph.closures import (
@@ -28,9 +29,9 @@ from umf_ros.pose_graph.closures import (
     check_closure,
     check_covariance,
     check_pose,
+    verdict_table,
 )
 from umf_ros.pose_graph.consistency import NoiseScale
-from umf_ros.pose_graph.g2o import verdict_table, write_g2o
 from umf_ros.pose_graph.odometry import POINT, PathPoints, Stamps
 from umf_ros.pose_graph.rejection import OutlierRejection
 from umf_ros.pose_graph.sessions import Sessions
@@ -168,8 +169,10 @@ class PoseGraph:
         if not self._reprocess(within_s) or self._ordered is None:
             return None
         (_, self._sessions, self._rejection), self._ordered = self._ordered, None
-        for row in np.flatnonzero(before.revoked).tolist():
-            self.revoke(*_endpoints(before.placed[row].closure))
+        rows = {id(placed): row for row, placed in enumerate(self._rejection.placed)}
+        for row in before.by_hand:
+            again, state = rows[id(before.placed[row])], before.verdicts[row].state
+            self._attempt(lambda: self._rejection.decide_by_hand(again, state))  # noqa: B023 (called at once)
         states = {id(placed): verdict.state for placed, verdict in zip(before.placed, before.verdicts, strict=True)}
         after = zip(self._rejection.placed, self._rejection.verdicts, strict=True)
         verdicts += [verdict for placed, verdict in after if verdict.state is not states[id(placed)]]
@@ -214,18 +217,18 @@ class PoseGraph:
             logger.warning("%s; the last trajectory stays", error)
             return []
 
-    def revoke(self, match_stamp_ns: int, query_stamp_ns: int) -> list[ClosureVerdict]:
-        """Revoke every closure between two keyframes for good.
+    def decide_by_hand(self, match_stamp_ns: int, query_stamp_ns: int, state: State) -> list[ClosureVerdict]:
+        """Accept or reject every closure between two keyframes whatever the evidence; pending takes that back.
 
         Raises:
-            GraphError: there is no such closure, or the graph cannot be solved without it.
+            GraphError: there is no such closure, or the graph cannot be solved so; then nothing has changed.
         """
         pairs = [_endpoints(placed.closure) for placed in self._rejection.placed]
         rows = [row for row, pair in enumerate(pairs) if pair == (match_stamp_ns, query_stamp_ns)]
         self._settled = False
         if not rows:
             raise GraphError(f"no closure between keyframes {match_stamp_ns} and {query_stamp_ns}")
-        return [verdict for row in rows for verdict in self._rejection.revoke(row)]
+        return [verdict for row in rows for verdict in self._rejection.decide_by_hand(row, state)]
 
     def _receive(self, closure: LoopClosure) -> ClosureVerdict | None:
         """Queue a closure; return the verdict of an unusable one."""

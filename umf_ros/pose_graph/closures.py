@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import io
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
@@ -32,6 +34,7 @@ class ClosureReason(StrEnum):
     TOO_FAR = "moves the pose by more than max_correction_m"
     OUTVOTED = "revoked: more places contradict it"
     BY_HAND = "revoked by hand"
+    ACCEPTED_BY_HAND = "accepted by hand"
     AGREES_WITH_POSE = "agrees with the pose"
     CONTRADICTS_POSE = "contradicts the pose"
     POSE_UNKNOWN = "the pose is not known yet"
@@ -90,6 +93,18 @@ class PlacedClosure(NamedTuple):
     match: int
     query: int
     closure: LoopClosure
+
+
+def verdict_table(verdicts: Iterable[ClosureVerdict]) -> str:
+    """All verdicts as CSV."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(VERDICT_COLUMNS)
+    for verdict in verdicts:
+        numbers = (f"{verdict.residual:.3f}", f"{verdict.residual_m:.3f}")
+        endpoints = verdict.closure.match_stamp_ns, verdict.closure.query_stamp_ns
+        writer.writerow([*endpoints, verdict.state.value, verdict.reason, *numbers])
+    return text.getvalue()
 
 
 Closures = NDArray[np.void]

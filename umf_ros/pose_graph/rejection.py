@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.errors import GraphError
 from umf_ros.core.geometry import Array, invert, logmap
 from umf_ros.pose_graph.closures import (
     ClosureReason,
@@ -50,6 +51,7 @@ _WRONG_ALONE = 0.1
 # nats at least (*by hand*; `aliased_sessions.py`: without, one group of wrong closures joined 4 of 40 graphs)
 _WRONG_BETWEEN = 10.0
 _EVEN = 0.5
+_BY_HAND = {State.ACCEPTED: ClosureReason.ACCEPTED_BY_HAND, State.REJECTED: ClosureReason.BY_HAND}
 
 
 class OutlierRejection:
@@ -89,8 +91,12 @@ class OutlierRejection:
         return self.closures[self._of(State.ACCEPTED)]
 
     @property
-    def revoked(self) -> NDArray[np.bool_]:
-        """(N,) whether closures were revoked for good."""
+    def by_hand(self) -> list[int]:
+        """Closures that a person decided about."""
+        return [row for row, verdict in enumerate(self.verdicts) if verdict.reason in _BY_HAND.values()]
+
+    @property
+    def _revoked(self) -> NDArray[np.bool_]:
         return self._of(ClosureReason.BY_HAND)
 
     def retune(self, settings: PoseGraphSettings) -> None:
@@ -147,12 +153,23 @@ class OutlierRejection:
         if self._map is not None:
             self.solve()
 
-    def revoke(self, row: int) -> list[ClosureVerdict]:
-        """Revoke a closure for good."""
+    def decide_by_hand(self, row: int, state: State) -> list[ClosureVerdict]:
+        """Accept or reject a closure whatever the evidence; pending leaves it to the evidence again.
+
+        Raises:
+            GraphError: the map cannot be solved so; then nothing has changed.
+        """
         before = list(self.verdicts)
-        self._reject(row, ClosureReason.BY_HAND)
-        if before[row].state is State.ACCEPTED:
-            self.solve()
+        reason = _BY_HAND.get(state, ClosureReason.UNSURE)
+        self.verdicts[row] = ClosureVerdict(self.placed[row].closure, state, reason)
+        if State.ACCEPTED in (before[row].state, state):
+            try:
+                self.solve()
+            except GraphError:
+                self.verdicts = before
+                raise
+        if state is State.PENDING and self._map is not None:
+            self._decide([row])
         return self._changed_since(before)
 
     def _decide_all(self) -> None:
@@ -172,10 +189,10 @@ class OutlierRejection:
         # only without other accepted closures: the map moved by those may contradict these
         if not reasons:
             reasons = dict.fromkeys(self._unopposed(), ClosureReason.UNOPPOSED)
-        self._near_map = []
-        if self._accept(reasons):  # closures near the moved map that are not accepted are compared again
-            rows = np.flatnonzero(~self._of(State.ACCEPTED) & ~self.revoked)
-            self._near_map = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
+        self._brought_close = []
+        if self._accept(reasons):  # closures not accepted that the moved map comes close to are compared again
+            rows = np.flatnonzero(~self._of(State.ACCEPTED) & ~self._revoked)
+            self._brought_close = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
         return bool(reasons)
 
     def _take(self, placed: PlacedClosure) -> int:
@@ -197,8 +214,8 @@ class OutlierRejection:
         return True
 
     def _gate(self, rows: Iterable[int]) -> list[int]:
-        """Compare closures with the map; return those that are consistent enough."""
-        closed = self._of(State.ACCEPTED) | self.revoked
+        """Compare closures with the map; returns those whose consistency with it suffices."""
+        closed = self._of(State.ACCEPTED) | self._revoked
         at = np.array([row for row in rows if not closed[row]], np.int64)
         if not len(at):
             return []
@@ -245,8 +262,8 @@ class OutlierRejection:
         return invert(self._sessions.at(chosen["match"]) @ chosen["pose"]) @ self._sessions.at(chosen["query"])
 
     def _supported_sets(self, rows: Iterable[int], state: State) -> list[list[int]]:
-        """Return consistency sets of closures of one state, each with one of `rows`, beyond chance."""
-        members = self._of(state) & ~self.revoked & ~self._of(ClosureReason.TOO_FAR)
+        """Consistency sets among the closures of one state, each with one of `rows`, that no chance explains."""
+        members = self._of(state) & ~self._revoked & ~self._of(ClosureReason.TOO_FAR)
         sets: list[list[int]] = []
         for row in rows:
             if members[row] and not any(row in found for found in sets):
@@ -258,12 +275,14 @@ class OutlierRejection:
         return sets
 
     def _overrule(self, rows: Iterable[int]) -> list[int]:
-        """Revoke accepted closures for a contradicted set of more places than those; return the set."""
-        accepted = self._of(State.ACCEPTED)
+        """Revoke accepted closures for a set that the map contradicts, of more places than those; returns the set."""
+        accepted, by_hand = self._of(State.ACCEPTED), self._of(ClosureReason.ACCEPTED_BY_HAND)
         for found in self._supported_sets(rows, State.REJECTED):
-            opponents = sorted({opponent for row in found for opponent in self._consistency.opponents(row, accepted)})
-            if self._consistency.count_places(opponents) < self._consistency.count_places(found):
-                for row in opponents:
+            losers = sorted({loser for row in found for loser in self._consistency.opponents(row, accepted)})
+            if by_hand[losers].any():
+                continue
+            if self._consistency.count_places(losers) < self._consistency.count_places(found):
+                for row in losers:
                     self._reject(row, ClosureReason.OUTVOTED)
                 return found
         return []
@@ -274,7 +293,7 @@ class OutlierRejection:
         Where the support of a closure suffices, the odometry between is wrong, not the closure.
         """
         members, outvoted = self._of(State.ACCEPTED), dict[int, ClosureVerdict]()
-        for row in np.flatnonzero(members).tolist():
+        for row in np.flatnonzero(members & ~self._of(ClosureReason.ACCEPTED_BY_HAND)).tolist():
             opponents = self._consistency.count_places(self._consistency.opponents(row, members))
             found, evidence = self._consistency.consistency_set(row, members) if opponents else ([], np.inf)
             if evidence < self.settings.min_support and opponents > self._consistency.count_places(found):
@@ -304,7 +323,7 @@ class OutlierRejection:
             queries = self.closures["query"]
             waited_m = queries["travel"][-1] - queries["travel"]
             waiting &= (queries["session"] != queries["session"][-1]) | (waited_m >= self.settings.patience_m)
-        companions = ~self._of(State.ACCEPTED) & ~self.revoked
+        companions = ~self._of(State.ACCEPTED) & ~self._revoked
         places = [[row, *self._consistency.companions(row, companions)] for row in np.flatnonzero(waiting).tolist()]
         self._gate(sorted({member for place in places for member in place}))
         # closures that are likelier wrong than right by the map do not count against others

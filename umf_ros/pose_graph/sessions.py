@@ -11,11 +11,12 @@ from scipy.sparse.csgraph import dijkstra
 
 from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.g2o import EDGE
 from umf_ros.core.geometry import Array, adjoint, invert, propagate
 from umf_ros.pose_graph.closures import Closures
 from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.odometry import POINT, CorrectedPath, OdometryChain, PathPoints, Rows, Stamps, noise_between
-from umf_ros.pose_graph.solver import EDGE, Graph, GraphSolver
+from umf_ros.pose_graph.solver import Graph, GraphSolver
 
 # lever arm in m that converts angular errors to displacements when paths through the graph are compared
 _LEVER_M = 10.0
@@ -138,13 +139,14 @@ class Sessions:
     def _stamps(self, closures: Closures, every_keyframe: bool = False) -> list[Stamps]:
         """Return stamps of the first or of every keyframe of each session, and of the endpoints of closures."""
         ends = [closures["match"], closures["query"]]
+        held = np.concatenate(ends)
         return [
             np.unique(
                 np.concatenate(
                     [
                         chain.stamps[: None if every_keyframe else 1],
                         *(end["stamp"][end["session"] == session] for end in ends),
-                        self.reference.stamps(session),
+                        self.reference.stamps(session, held[held["session"] == session]["travel"]),
                     ]
                 )
             )

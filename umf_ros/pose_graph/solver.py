@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from umf_ros.core.errors import GraphError, one_line
 from umf_ros.core.geometry import Array
 
-EDGE = np.dtype([("first", "i8"), ("second", "i8"), ("pose", "f8", (4, 4)), ("covariance", "f8", (6, 6))])
-"""Fields of an array of edges; see `Edge`."""
 _ANCHOR = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
 _MOST_STEPS = 30
 # radians and metres: a step this small leaves an error below a micrometre, so that a map solved at once, as after a

@@ -21,7 +21,8 @@ from umf_ros.runs.truth import JudgedRun, in_words
 REFUSED = ("size", "encoding", "step", "truncated", "compressed", "fields", "datatype", "unusable", "stamp")
 """Reasons for which a message is unusable by itself."""
 MUCH_MISSED, MUCH_REJECTED, WELL_COVERED = 0.3, 0.2, 0.5
-"""Shares worth a finding, by hand: of revisits, of closures, of keyframes."""
+"""Shares, by hand: of revisits, of closures, of keyframes."""
+REACH = "the odometry must reach the keyframes of the closures"
 FEW_VIEWS, BIAS_PX = 5, 0.35
 """Least number of closures by images for a bias of the disparities, and least bias, by hand."""
 SLOW = 1.0
@@ -119,17 +120,22 @@ def gap_remedy(seconds: float, metres: float | None, settings: Settings) -> str:
 def _graph(about: JudgedRun) -> Iterator[Advice]:
     verdicts, states = about.run.verdicts.values(), _states(about)
     total, pending = states.total(), states[State.PENDING]
-    rejected = states[State.REJECTED] + states[State.REFUSED]
-    reasons = Counter(one.reason for one in verdicts if one.state != State.ACCEPTED).most_common(1)
     if pending and not states[State.ACCEPTED]:
-        what = f"all closures are pending: the graph used none of {total} ({reasons[0][0]})"
-        remedy = "the odometry must cover the keyframes of the closures; pending is not rejected"
-        yield Advice("fault", f"{what}, so the optimised trajectory is the odometry", remedy)
-    elif rejected > MUCH_REJECTED * total:
-        sigma = np.nanmedian([one.residual for one in verdicts if one.state == State.REJECTED] or [np.nan])
-        what = f"the graph rejected {rejected} of {total} closures ({reasons[0][0]}, {sigma:.1f} sigma in the median)"
-        settings = "pose_graph.odometry_sigma_m and odometry_sigma_deg"
-        yield Advice("warning", what, f"odometry worse than {settings} state, or wrong closures: inspect some")
+        reason = Counter(one.reason for one in verdicts if one.state != State.ACCEPTED).most_common(1)[0][0]
+        what = f"all closures are pending: the graph used none of {total} ({reason})"
+        yield Advice(
+            "fault", f"{what}, so the optimised trajectory is the odometry", f"{REACH}; pending is not rejected"
+        )
+        return
+    worse = "odometry worse than pose_graph.odometry_sigma_m and odometry_sigma_deg say, or wrong closures: click some"
+    for state, remedy in ((State.REJECTED, worse), (State.REFUSED, REACH)):
+        own = [one for one in verdicts if one.state == state]
+        if len(own) > MUCH_REJECTED * total:
+            reason = Counter(one.reason for one in own).most_common(1)[0][0]
+            sigma = (
+                f", {np.nanmedian([one.residual for one in own]):.1f} sigma in the median" if remedy == worse else ""
+            )
+            yield Advice("warning", f"the graph {state} {len(own)} of {total} closures ({reason}{sigma})", remedy)
 
 
 def _absolute(about: JudgedRun) -> Iterator[Advice]:

@@ -25,10 +25,10 @@ from rich.table import Table as Grid
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.reader import Bag
-from umf_ros.bags.sensor_check import SensorCheck, SensorReport
+from umf_ros.bags.sensor_check import SensorCheck, SensorReport, check_stream
 from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.errors import UmfError
-from umf_ros.core.frames import Frame, Image, LoopClosure
+from umf_ros.core.frames import Image, LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import write_atomically
 from umf_ros.core.trajectory import Trajectory
@@ -355,15 +355,8 @@ def _report_sensors(run: FinishedRun, bag: Bag, check: SensorCheck | None) -> Se
     """Compare the checked frames, or else those of the recording, with the odometry."""
     if check is not None:
         return check.report(read_odometry_of(run.folder) or run.odometry)
-    check, stamps, poses = SensorCheck(), [-1], list[Array]([np.eye(4)])
-    for item in FrameReader(bag, run.settings, _odometry_file(run), warn=lambda _: None).stream():
-        if isinstance(item, Frame):
-            check.take(item)
-        elif item.stamp_ns > stamps[-1]:  # while its stamps increase
-            stamps.append(item.stamp_ns)
-            poses.append(item.odom_T_body)
-    odometry = Trajectory(np.array(stamps[1:], np.int64), np.stack(poses)[1:]) if len(stamps) > 1 else run.odometry
-    return check.report(odometry)
+    stream = FrameReader(bag, run.settings, _odometry_file(run), warn=lambda _: None).stream()
+    return check_stream(stream, run.odometry)
 
 
 def _odometry_file(run: FinishedRun) -> Trajectory | None:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from umf_ros.core.config import Group, Settings, load_preset, problems
+from umf_ros.core.config import TRANSFORMS, Group, Settings, load_preset, problems
 from umf_ros.core.errors import CalibrationError, ConfigError, one_line
 from umf_ros.core.frames import Image, StereoCamera
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose
@@ -99,6 +99,7 @@ class Calibration:
         max_height_m: returns further than this from the LiDAR's horizontal plane are dropped; infinite: none.
         guesses: entries of the file that are marked as guesses.
         antenna: (3,) m, the GNSS antenna.
+        is_open: whether nothing is known yet: `/tf_static` and camera_info have to say it.
         rectifier: makes the pair of `camera` from raw images; None where they arrive rectified.
     """
 
@@ -112,6 +113,7 @@ class Calibration:
     rectifier: StereoRectifier | None = None
     guesses: tuple[str, ...] = ()
     antenna: Array = field(default_factory=lambda: np.zeros(3))
+    is_open: bool = False
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -126,7 +128,9 @@ class Calibration:
 
 
 def calibration_of(settings: Settings) -> Calibration:
-    """Return the calibration that the settings name, else that of the data set; raises as `load_calibration`."""
+    """The calibration that the settings name, else that of the data set; raises as `load_calibration`."""
+    if settings.calibration == TRANSFORMS:
+        return Calibration(StereoCamera(0, 0, 1.0, 1.0, 0.0, 0.0, 0.0), np.eye(4), np.eye(4), is_open=True)
     return load_calibration(settings.calibration or settings.dataset)
 
 

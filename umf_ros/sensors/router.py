@@ -58,6 +58,7 @@ class MessageRouter:
         self._on_odometry = on_odometry
         self._warn = warn
         self._warned: set[tuple[str, str]] = set()
+        self._is_raw = "rect" not in topics.left_image
         self._stereo_info = bool(topics.right_info and topics.right_image)
         self._infos: dict[str, tuple[Any, Any]] = {}
         self._said: dict[str, Any] = {}
@@ -125,6 +126,9 @@ class MessageRouter:
         known = self._infos.get(entry, (None, None))[0]
         if content != known and (known is None or repeated):
             decode_camera_info(message)
+            if self._is_raw and self._frames is not None and self._frames.is_open and np.any(np.array(message.d)):
+                text = "the images are raw, with lens distortion: rectify them (image_proc), or name a calibration"
+                raise MessageError("raw", text)
             self._infos[entry] = content, message
         left, right = (self._infos.get(name, (None, None)) for name in ("left_info", "right_info"))
         if left[1] is None or self._used == (left[0], right[0]):

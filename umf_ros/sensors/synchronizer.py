@@ -155,6 +155,8 @@ class Synchronizer:
             MessageError: of kind "size" when the calibration is for other images.
         """
         expected = self._calibration.image_size
+        if name in ("left", "right") and not expected[0]:
+            raise MessageError("camera_info", "image before its camera_info, and no calibration is named")
         if name in ("left", "right") and value.shape[::-1] != expected:
             found = f"image of {value.shape[1]} x {value.shape[0]} pixels"
             raise MessageError("size", f"{found}, the calibration is for {expected[0]} x {expected[1]}")

@@ -87,23 +87,41 @@ class BodyFrames:
         self.odom = frames.odom
 
     def pose_of(self, frame_id: str) -> Array | None:
-        """Return (4, 4) pose of a frame on the body; None where the transforms lack it."""
-        return self._transforms.find(self._base, frame_id) if frame_id else None
+        """(4, 4) pose of a frame on the body; None where the transforms do not say it, and a calibration does.
+
+        Raises:
+            MessageError: of kind "transforms": nothing says it.
+        """
+        pose = self._transforms.find(self._base, frame_id) if frame_id else None
+        if pose is None and self.is_open:
+            where = f"{TOPIC} does not say where {frame_id or 'a sensor without frame_id'} is on {self._base}"
+            raise MessageError("transforms", f"{where} (parameters calibration, frames.base)")
+        return pose
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the transforms alone say where the sensors are."""
+        return self._calibration is not None and self._calibration.is_open
 
     def mounting(self, sensor: str, frame_id: str) -> dict[str, Any]:
         """Return the new pose of a "camera" or a "lidar", as `body_T_camera` or `body_T_lidar`; empty if unchanged.
 
         Warn once about a new pose, with its distance from that of the calibration.
+
+        Raises:
+            MessageError: of kind "transforms": neither the transforms nor a calibration have it.
         """
         state = frame_id, self._transforms.version
         if self._calibration is None or self._mounted.get(sensor) == state:
             return {}
+        pose = self.pose_of(frame_id)
+        upright = sensor == "camera" and pose is not None and pose[2, 2] > _UP
+        if upright and self.is_open:
+            raise MessageError("transforms", f"{frame_id} is not an optical frame: its z axis is up")
         self._mounted[sensor] = state
-        pose = self._transforms.find(self._base, frame_id) if frame_id else None
-        if pose is None:
-            return {}
-        if sensor == "camera" and pose[2, 2] > _UP:
+        if upright:
             self._warn(f"{frame_id} is not an optical frame (its z axis is up): the calibration's pose is kept")
+        if pose is None or upright:
             return {}
         if sensor == "camera" and self._calibration.rectifier is not None:
             pose = pose @ self._calibration.rectifier.raw_T_rectified
@@ -111,9 +129,10 @@ class BodyFrames:
         before = self._poses.get(name, getattr(self._calibration, name))
         if np.allclose(pose, before, atol=1e-6):
             return {}
-        apart_m = float(np.linalg.norm(pose[:3, 3] - before[:3, 3]))
-        where = f"its pose is that of {frame_id} in {self._base} on {TOPIC}"
-        self._warn(f"{sensor}: {where}, {apart_m:.2f} m from the file's")
+        if not self.is_open:
+            apart_m = float(np.linalg.norm(pose[:3, 3] - before[:3, 3]))
+            where = f"its pose is that of {frame_id} in {self._base} on {TOPIC}"
+            self._warn(f"{sensor}: {where}, {apart_m:.2f} m from the file's")
         self._poses[name] = pose
         return {name: pose}
 

@@ -24,7 +24,7 @@ class SubmapFinder:
     Sixteen beams in the open hit little that another scan hits too, and a narrow sensor that comes back the other way
     shares nothing with its earlier scans; merged over some metres by odometry, they do. Submaps are verified as scans
     are: the candidates are those whose scans came near to a closure, the place where odometry puts the rover since the
-    latest closure, and now and then those whose relief has the same keypoints.
+    latest closure, or else those that look most alike, to the network and by the keypoints of their relief.
 
     Keyframes must come in order. Without odometry, or with scans that show enough, nothing is done.
 
@@ -42,7 +42,9 @@ class SubmapFinder:
         self._verifier = Verifier(settings)
         self.history = SubmapHistory(database)
         self._lookalikes = Lookalikes()
-        self._next = self._stored = len(self.history.anchors)
+        sessions = np.unique(database.store.keys["session"]).tolist()
+        rows = [self.history.rows(session, 0.0, np.inf)[:: const.DESCRIBED_EVERY] for session in sessions]
+        self._stored: list[int] = np.concatenate([np.empty(0, np.intp), *rows]).tolist()
         self.reset()
 
     def retune(self, settings: Verification, rules: Loop) -> None:
@@ -53,9 +55,9 @@ class SubmapFinder:
     def reset(self) -> None:
         """Forget what was found lately; the places stay."""
         self._latest: tuple[Keyframe, Keyframe, Array] | None = None
+        self._described_m = 0.0
         self._verifier.reset()
         self.history.reset()
-        self._asked_m = -np.inf
 
     def find(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> list[Hypothesis]:
         """The verdicts about the candidates of a keyframe, with those about submaps where scans found nothing.
@@ -68,7 +70,7 @@ class SubmapFinder:
             return list(verdicts)
         expected = self._expected(query)
         candidates = self._candidates(query, verdicts, expected)
-        guesses = NO_GUESSES if expected is None else {self.history.anchors[expected[0]].stamp_ns: expected[1]}
+        guesses = NO_GUESSES if expected is None else {self.history.database[expected[0]].stamp_ns: expected[1]}
         compared = self.compare(query, candidates, guesses)
         self._note_closures(query, compared)
         known = {one.candidate.stamp_ns for one in compared}
@@ -90,14 +92,26 @@ class SubmapFinder:
             if match.session == query.session:  # scans that both submaps hold are alike for no other reason
                 last_m = (match.path_length_m + query.path_length_m) / 2
                 first_m = max(first_m, last_m)
-            pairs.append((candidate, self.history.around(match, last_m) or match))
+            pairs.append((candidate, self.history.around(candidate.index, last_m) or match))
         submap = self.history.before(query, first_m) if pairs else None
         return [] if submap is None else self._verifier.verify(submap, pairs, guesses)
 
     def remember(self, keyframe: Keyframe) -> None:
         """Take up a keyframe that was added to the database; one without a scan adds nothing to a submap."""
         if self.history.add(keyframe) and self.history.needed:
-            self._describe()
+            self._describe(keyframe)
+
+    def _describe(self, newest: Keyframe) -> None:
+        """Describe the submap that the newest keyframe completes, and one that was stored before, the latest first."""
+        complete_m = newest.path_length_m - const.ODOMETRY_REACH_M
+        rows = self.history.rows(newest.session, self._described_m, complete_m)[:1].tolist()
+        if rows:
+            described = self.history.database[rows[0]]
+            self._described_m = described.path_length_m + const.DESCRIBED_EVERY * const.MERGE_STEP_M
+        rows += [self._stored.pop()] if self._stored else []
+        for row in rows:
+            if (submap := self.history.around(row)) is not None:
+                self._lookalikes.add(row, submap)
 
     def _note_closures(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> bool:
         """Whether there are closures; odometry carries the last of them on to the next keyframes."""
@@ -107,13 +121,12 @@ class SubmapFinder:
         return bool(closures)
 
     def _expected(self, query: Keyframe) -> tuple[int, Array] | None:
-        """Row of the nearest anchor where odometry puts the rover, and `match_T_query` there; None without one."""
+        """Row of the nearest keyframe where odometry puts the rover, and `match_T_query` there; None without one."""
         for session, odom_T_query, first_m, last_m in self._predictions(query):
-            rows = self.history.rows(session, first_m, last_m)
-            rows = rows[self.history.past(query, rows, self._rules)]
+            rows = self.history.past(query, self.history.rows(session, first_m, last_m), self._rules)
             poses = [relative(self.history.odometry(row), odom_T_query) for row in rows.tolist()]
             away = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
-            if away and min(away) < const.SUBMAP_NEAR_M:
+            if away and min(away) < const.SAME_PLACE_M:
                 best = int(np.argmin(away))
                 return int(rows[best]), poses[best]
         return None
@@ -140,46 +153,23 @@ class SubmapFinder:
         found = [one.candidate for one in verdicts if (one.probability or 0.0) >= const.PROMISING]
         if expected is not None:
             found.append(self._candidate(query, expected[0]))
-        elif query.path_length_m - self._asked_m >= const.ASKED_EVERY_M:
-            self._asked_m = query.path_length_m
+        else:
             found += [verdicts[0].candidate] if verdicts else []
             found += [self._candidate(query, row) for row in self._look_alike(query)]
         return list({candidate.index: candidate for candidate in found}.values())
 
     def _candidate(self, query: Keyframe, row: int) -> Candidate:
-        anchor = self.history.anchors[row]
-        index = self.history.index_of(anchor)
-        assert index is not None
-        match = self.history.database[index]
-        similarity = float(query.embedding.descriptor @ match.embedding.descriptor)
-        return Candidate(index, anchor.stamp_ns, similarity)
+        match = self.history.database[row]
+        return Candidate(row, match.stamp_ns, float(query.embedding.descriptor @ match.embedding.descriptor))
 
     def _look_alike(self, query: Keyframe) -> list[int]:
-        """Rows of the anchors whose submaps look most like that of a keyframe."""
-        submap, rows = self.history.before(query), np.array(self._lookalikes.rows, np.intp)
-        if submap is None or not len(rows):
+        """Rows of the database whose submaps share most keypoints with that of a keyframe."""
+        submap = self.history.before(query)
+        if submap is None:
             return []
+        rows = self.history.past(query, np.array(self._lookalikes.rows, np.intp), self._rules)
+        keys = self.history.database.store.keys[rows]
         # scans that both submaps hold are alike for no other reason
-        first_m = query.path_length_m - const.SUBMAP_BEFORE_M - const.SUBMAP_AFTER_M
-        anchors = [self.history.anchors[row] for row in rows]
-        apart = np.array([one.session != query.session or one.path_length_m < first_m for one in anchors])
-        return self._lookalikes.search(submap, apart & self.history.past(query, rows, self._rules))[: const.LOOKALIKES]
-
-    def _describe(self) -> None:
-        """Describe the anchors whose submaps are complete now, and one that was stored before, the latest first."""
-        anchors = self.history.anchors
-        while self._next < len(anchors):
-            complete_m = anchors[self._next].path_length_m + const.SUBMAP_AFTER_M
-            if anchors[self._next].session == anchors[-1].session and anchors[-1].path_length_m < complete_m:
-                break
-            self._describe_anchor(self._next)
-            self._next += const.DESCRIBED_ANCHORS
-        if self._stored > 0:
-            self._stored = max(self._stored - const.DESCRIBED_ANCHORS, 0)
-            self._describe_anchor(self._stored)
-
-    def _describe_anchor(self, row: int) -> None:
-        index = self.history.index_of(self.history.anchors[row])
-        submap = None if index is None else self.history.around(self.history.database[index])
-        if submap is not None:
-            self._lookalikes.add(row, submap)
+        first_m = query.path_length_m - 2 * const.ODOMETRY_REACH_M
+        apart = (keys["session"] != query.session) | (keys["travelled_m"] < first_m)
+        return self._lookalikes.search(submap, rows[apart])[: const.LOOKALIKES]

@@ -58,7 +58,7 @@ def common_keypoints(query: Keypoints, match: Keypoints) -> int:
         return 0
     cv2.setRNGSeed(0)
     motion, inliers = cv2.estimateAffinePartial2D(
-        query.places[here], match.places[there[here]], ransacReprojThreshold=const.KEYPOINT_M, maxIters=300
+        query.places[here], match.places[there[here]], ransacReprojThreshold=2 * const.TERRAIN_CELL_M, maxIters=300
     )
     if motion is None or abs(float(np.hypot(motion[0, 0], motion[1, 0])) - 1) > const.KEYPOINT_SCALE:
         return 0
@@ -73,18 +73,18 @@ class Lookalikes:
         self._submaps: list[Keypoints] = []
 
     def add(self, row: int, submap: Keyframe) -> None:
-        """Add the submap of an anchor."""
+        """Add the submap of a row of the database."""
         self.rows.append(row)
         self._submaps.append(keypoints_of(submap))
 
-    def search(self, submap: Keyframe, admissible: NDArray[np.bool_]) -> list[int]:
-        """Rows of the anchors whose submaps share most keypoints with one, best first.
+    def search(self, submap: Keyframe, admissible: NDArray[np.intp]) -> list[int]:
+        """Rows whose submaps share most keypoints with one, best first.
 
         Args:
             submap: of the newest keyframe.
-            admissible: (N,) submaps that may be returned, in the order in which they were added.
+            admissible: rows that may be returned.
         """
-        query, allowed = keypoints_of(submap), np.flatnonzero(admissible)
+        query, allowed = keypoints_of(submap), np.flatnonzero(np.isin(self.rows, admissible))
         if len(query.places) < const.MIN_KEYPOINTS or not len(allowed):
             return []
         votes = self._votes(query, allowed)

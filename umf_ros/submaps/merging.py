@@ -119,7 +119,7 @@ class DriftMeter:
             return
         moved = _body_T_other(before[0], keyframe)
         aligned = align_scans(match, query, moved)
-        if aligned.overlap >= const.DRIFT_OVERLAP:
+        if aligned.overlap >= const.ENOUGH_SEEN:
             gap = relative(moved, aligned.pose)
             way_m = float(ways_m[oldest[aligned.pairs[:, 1]]].mean())
             self._gaps.append(np.array([*gap[:3, 3], heading(gap), way_m]))

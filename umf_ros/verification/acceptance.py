@@ -21,7 +21,7 @@ from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, RejectReason, k
 from umf_ros.verification.scan_alignment import CovarianceModel
 
 SHIPPED = "config/verification/calibration.json"
-WITHOUT_RIVALS = {"rival_near": 10.0, "rival_far": 10.0}  # beyond the best that any criterion asks for
+WITHOUT_RIVALS = {"rival_near": math.inf, "rival_far": math.inf}
 Measurements = dict[str, float]
 
 
@@ -44,7 +44,7 @@ class Criterion:
     def __call__(self, measurements: Measurements) -> float:
         """Score between 0 and 1."""
         value = self.read(measurements)
-        if not math.isfinite(value):
+        if math.isnan(value):
             return self.missing
         return min(max((value - self.worst) / (self.best - self.worst), 0.0), 1.0)
 

@@ -38,7 +38,8 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     across = np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1]
     way = np.append(across, 0.0)
     beside, along = (_shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
-    poses = np.stack([pose, *beside, *along, *_other_peaks(match, query, pose)])
+    peaks = [one for one in alternatives(match, query, pose) if not near(one, pose, const.DISTINCT_M, np.inf)]
+    poses = np.stack([pose, *beside, *along, *peaks])
     misfits = _point_misfit(match, query, poses), _point_misfit(query, match, invert(poses))
     fit, far = np.log(np.maximum(sum(misfits) / 2, const.MISFIT_FLOOR)), 1 + len(beside)
     return {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
@@ -46,19 +47,13 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
 
 def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array:
     """(K,) mean misfit with a scan of the other's visible points at poses (K, 4, 4); the worst where few are."""
-    sample = other.sample[:: const.RIVAL_EVERY]
-    points = (sample @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
-    reach = np.tile(counterpart_reach(other.spacing[:: const.RIVAL_EVERY], common_blur(scan, other)), len(poses))
+    points = (other.scouts @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
+    reach = np.tile(counterpart_reach(other.spacing[:: const.SCOUT_EVERY], common_blur(scan, other)), len(poses))
     misfit = np.minimum(np.sqrt(scan.nearest(points)[1]) / reach, const.RIVAL_MISFIT)
     seen = visible(scan.look_at(points)).reshape(len(poses), -1)
     count = seen.sum(axis=1)
     mean = (misfit.reshape(seen.shape) * seen).sum(axis=1) / np.maximum(count, 1)
     return np.where(count >= const.FEWEST_POINTS, mean, const.RIVAL_MISFIT)
-
-
-def _other_peaks(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
-    """Poses at the other peaks of the search at the heading of a pose."""
-    return [one for one in alternatives(match, query, pose) if not near(one, pose, const.DISTINCT_M, np.inf)]
 
 
 def _shifted(pose: Array, way: Array, shifts: Array) -> Array:
@@ -72,9 +67,9 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
     """How much worse the surfaces of two scans fit at the best other pose along a passage.
 
     A place is a passage where surfaces across it outweigh those along it. Poses are shifted along the passage as far
-    as the scans overlap; the other peaks of the search at the same heading are rivals, too. Where bays repeat, a scan
-    fits every other one best at the smallest shift, at the identity even by the pattern of the sensor alone. There
-    each scan is also compared with itself, shifted likewise: where it fits itself elsewhere, it cannot tell the place.
+    as the scans overlap. Where bays repeat, a scan fits every other one best at the smallest shift, at the identity
+    even by the pattern of the sensor alone. There each scan is also compared with itself, shifted likewise: where it
+    fits itself elsewhere, it cannot tell the place.
 
     Args:
         match: the matched scan.
@@ -91,7 +86,7 @@ def passage_rival(match: PreparedScan, query: PreparedScan, pose: Array) -> floa
     if way is None:
         return float("nan")
     shifted = _shifted(pose, way, np.concatenate([const.RIVAL_NEAR_M, const.PASSAGE_FAR_M]))
-    fits = _surface_misfit(match, query, np.stack([pose, *shifted, *_other_peaks(match, query, pose)]))
+    fits = _surface_misfit(match, query, np.concatenate([pose[None], shifted]))
     rival = float(fits[1:].min() - fits[0]) / const.PASSAGE_RIVAL
     if rival < 1.0 or np.linalg.norm(pose[:3, 3]) >= const.HALF_BAY_M:
         return rival
@@ -122,13 +117,21 @@ def _across(scan: PreparedScan, normals: Array) -> tuple[Array, Array]:
 
 
 def _surface_misfit(match: PreparedScan, query: PreparedScan, poses: Array) -> Array:
-    """(K,) logarithm of the mean misfit of both scans with each other at poses (K, 4, 4), the one in question first."""
-    misfits = _misfit_with(match, query, poses), _misfit_with(query, match, invert(poses))
-    found: Array = np.log(sum(misfits) / 2 + const.MISFIT_FLOOR)
+    """Logarithm of the mean misfit of both scans with each other at the first of poses (K, 4, 4), and at its rivals.
+
+    Some points tell which of the others are rivals.
+    """
+    few = _mutual_misfit(match, query, poses, const.SCOUT_EVERY)
+    rivals = np.argsort(few[1:])[: const.PEAKS] + 1
+    found: Array = np.log(_mutual_misfit(match, query, poses[np.append(0, rivals)]) + const.MISFIT_FLOOR)
     return found
 
 
-def _misfit_with(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array:
+def _mutual_misfit(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Array:
+    return (_misfit_with(match, query, poses, every) + _misfit_with(query, match, invert(poses), every)) / 2
+
+
+def _misfit_with(scan: PreparedScan, other: PreparedScan, poses: Array, every: int) -> Array:
     """(K,) mean misfit, 0 to 1, of the other scan's points with the scan's planes; 1 where far fewer can be compared.
 
     Points of every second band of elevations are compared with planes of the bands between: a ring never meets itself.
@@ -136,7 +139,9 @@ def _misfit_with(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array
     total, count = np.zeros(len(poses)), np.zeros(len(poses), int)
     for planes, others in zip(scan.surfaces, reversed(other.surfaces), strict=True):
         picks = np.linspace(0, len(others.points) - 1, min(const.PASSAGE_SAMPLE, len(others.points))).astype(np.intp)
-        points = (others.points[picks] @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
+        points = (others.points[picks[::every]] @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(
+            -1, 3
+        )
         found, squared = planes.tree.batch_nearest_neighbor_search(points, num_threads=1)
         index = np.asarray(found, np.intp)
         away = np.einsum("ij,ij->i", points - planes.centres[index], planes.normals[index])

@@ -16,108 +16,85 @@ IMAGE_THRESHOLD = 0.03  # of the image's width; geometry: a cell of the feature 
 POINT_THRESHOLD_M = 0.75  # geometry: the cells of the voxel features are about a metre wide
 SERIAL_PRODUCTS = 2**18  # multiplications up to which OpenBLAS stays on one thread; its others would spin for nothing
 SUPERFEATURE_RATIO = 0.9  # [UMF eq. 4.1]
-SAME_PLACE_M = 3.0  # by hand: candidates nearer than this to a chosen one show the same place
+SAME_PLACE_M = 4.0  # by hand: keyframes nearer than this, as odometry has it, show the same place
 MAX_TILT_RAD = 0.5  # by hand: a rover does not lie on its side
 
 # hypotheses: which poses are worth a closer look?
-MIN_POINTS = 6  # by hand: that agree on a motion
 MIN_PIXELS = 15  # measured: that agree on a view; of other places never more than 13 did
-DISTINCT_M, DISTINCT_RAD = 0.8, 0.1  # geometry: nearer hypotheses end in the same basin of the alignment
-SAME_M, SAME_RAD = 0.05, 0.01  # geometry: of the error of a right pose; aligned hypotheses this near are one
+DISTINCT_M, DISTINCT_RAD = 0.8, 0.1  # geometry: nearer poses end in the same basin of the alignment
 MIN_MAP_SCORE = 5.0  # by hand, in standard deviations of chance: below, two maps fit no better than noise
 MAX_REFINED = 3  # hypotheses per group of candidates that are aligned: bounds the time
-HOPELESS = 0.5  # by definition: an improbable pose, whatever its rivals, is not compared with them
 
 # views: what two images say about a pose
 # standard deviation of a feature's place, of the image's width. XFeat's: a pixel in 688, measured on right pairs under
 # another sun; the network's own lie at the centres of cells of 1.8 %
 VIEW_NOISE = {"xfeat": 0.0015, "umf": 0.006}
-DISPARITY_NOISE = 0.0005  # of the image's width, a third of a pixel; measured likewise
 DISPARITY_BIAS = 0.0007  # of the image's width, half a pixel: of a rectification that is not quite right, by hand
-VIEW_REACH = 4.0  # standard deviations: what agrees with a pose of RANSAC
 VIEW_SAMPLES = 300  # measured: three times as many find 3 % more, a third of them 3 % less
-VIEW_STEPS, VIEW_TOLERANCE = 8, 1e-4  # of Gauss-Newton; m and rad, far below what is known
-VIEW_KERNEL = 9.0  # squared standard deviations: three of them halve the pull of a feature
-VIEW_GATE, VIEW_NEAR = 11.3, 100.0  # likewise; 99 % of a chi-square of three, and what the refinement may draw in
-MIN_VIEW_SIGMAS = 0.5  # no pair of images is better than half the noise assumed
-UNMEASURED = 1e6  # pixels^2: the variance of a disparity that was not measured
-NEAREST_SEEN_M = 0.3  # nothing nearer than this is in front of a camera
+VIEW_GATE = 11.3  # squared standard deviations, 99 % of a chi-square of three: what agrees, and the kernel
 NOMINAL_BASELINE_M = 0.2  # S3LI's: how well depths of a camera without a right one are taken to be known
 
 # grid maps: how well do relief and structure fit?
 REACH_CELLS = 15.0  # measured: the median range of a scan in cells
 MAP_RADIUS, MAP_SHIFT = 26, 12  # geometry: cells; 26 + 26 + 12 come round to themselves no more
 MAP_CELL_M = (0.25, 1.0)  # by hand: rooms, fields
-TERRAIN_CELL_M, TERRAIN_RADIUS = 0.5, 56  # by hand: rocks and ripples are seen; geometry: beyond, holes prevail
+TERRAIN_CELL_M = 0.5  # by hand: rocks and ripples are seen
 PLANE_SIGMA_CELLS = 2.4  # by hand: relief is what rises above a plane about this wide
-PLANE_RIDGE_CELLS2 = 1.2  # keeps the slope of that plane finite where the neighbours lie on a line
 MAX_RELIEF_CELLS = 0.4  # by hand: one boulder must not outvote a field
-MIN_CELLS = 50  # by hand: cells below which a fit means nothing
-MIN_NEIGHBOURHOOD = 0.25  # by hand: weight of the occupied cells around one, of all, below which it has no relief
-LAYER_M = 0.3  # by hand: just more than the thinning
-TALL_LAYERS, MIN_TALL = 3, 20  # by hand: cells of walls, trunks and boxes, and how many make a place
+KNOWN_NEIGHBOURHOOD = 0.3  # by hand: share of the cells around one that must be known, of a map or a range image
+TALL_LAYERS = 3  # by hand: cells of walls, trunks and boxes
 BARE_RELIEF_CELLS = 0.02  # measured on simulated drives: of bare, even ground .004, of the plainest of other places .06
 BARE_ODDS = 10.0  # by hand: bare ground whose texture comes again elsewhere is that much likelier than a view that does
 # measured: of images that agree about bare ground from .097, of 80 of umf_ros/lab/simulation/scenes.py to .096
 BARE_SPREAD = 0.1
 
 # search over all headings
-SECTORS = 72  # of 5 deg, by hand
-MIN_SECTOR_SHARE = 1e-3  # by hand: of all points; fewer are strays
 ALL_HEADINGS = np.radians(np.arange(0.0, 360.0, 6.0))  # geometry: half a step is within reach of the alignment
 SEARCHED_OVERLAP = 0.45  # by hand: a view of 70 deg is looked for within 38
-PEAKS, ALTERNATIVES = 4, 2  # by hand: of relief alone and with structure, at all headings and at one
-SETTLE_MEDIANS, MAX_SLOPE = 2.5, 0.3  # by hand: ground of one map on the other's, rad
-SCOUTS, SCOUT_STEPS = 300, 5  # by hand: points and steps of ICP that refine a peak
-SCOUT_REACH, SCOUT_NEAR = 1.5, 0.3  # cells; geometry: a peak is off by less than a cell and half a heading
+PEAKS = 4  # by hand: of relief alone and with structure, at all headings; half of them at one
+SCOUT_EVERY = 5  # measured: of the sample, points that refine a peak; a tenth finds less among trees
+SCOUT_NEAR = 0.3  # cells; geometry: where a counterpart lies after some steps
 TERRAIN_WEIGHT = 0.02  # measured: counterparts rank best among walls, terrain in the open
 
 # registration
 THIN_CELL_M = 0.25  # by hand: a scan keeps some 4,500 of its returns
 MAX_RANGE_M = 40.0  # geometry: beyond, returns of a flat scan are metres apart
-NORMAL_NEIGHBOURS = 10  # small_gicp's own default
 NEIGHBOURS = 5  # by hand: they reach the next ring
+PLANE_NEIGHBOURS = 8  # measured: 12 leave next to no planes of sixteen rings
 SAMPLE = 1500  # measured: points of the query that are aligned; a third of the scan is as good in half the time
-COARSE_REACH_M, COARSE_STEPS = 1.0, 10  # geometry: two cells of the maps
-COARSE_EVERY = 3  # of the sample; measured: all of it ends within a millimetre of the same poses
-FINE_REACH_M, FINE_STEPS = 0.4, 8  # by hand: the spacing of far returns is wider than the noise
+COARSE_REACH_M = 1.0  # geometry: two cells of the maps
+FINE_REACH_M = 0.4  # by hand: the spacing of far returns is wider than the noise
+STEPS = 8  # by hand: of every refinement, of scans and of views
 MIN_SCAN_POINTS = 100  # by hand: below, there is nothing to align
-SCANS_KEPT = 60  # prepared scans in memory: bounds it, changes no result
+SCANS_KEPT = 60  # scans and submaps in memory: bounds it, changes no result
 
 # covariance
 SEARCH_M, SEARCH_RAD = 3.0, 0.35  # what the search itself knows, standard deviation: nothing is wider than this
-NOMINAL_INFLATION, NOMINAL_FLOOR_M, NOMINAL_FLOOR_DEG = 20.0, 0.01, 0.05  # by hand: a yardstick independent of data
+NOMINAL_INFLATION = 20.0  # by hand: a yardstick independent of data
 MOMENTS = 6  # parts of a scan whose errors of motion are told apart; by hand: errors change little within a sixth
 MOTION_SHARE = 0.03  # by hand: of the motion during a scan that odometry gets wrong all along, as by its scale
 MIN_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanner is better
 
 # free space: what the rays of one scan say of the points of another
-SIGHT_ROWS, SIGHT_COLUMNS = 90, 180  # geometry: cells of two degrees, as far apart as the rings of sixteen beams
+SIGHT_DEG = 2.0  # geometry: cells as far apart as the rings of sixteen beams
 SIGHT_MARGIN_M, SIGHT_MARGIN = 0.3, 0.03  # by hand: noise, motion and error of the pose, which grows with the range
-SIGHT_KNOWN = 0.3  # by hand: of a cell's neighbourhood that must have returns for its rays to be known
 SIGHT_FROM_M = 0.8  # by hand: nearer than this is the robot itself
-SIGHT_FILLED_M = 5.0  # geometry: nearer, a thinned point is wider than a cell and its neighbours' gaps
 
 # consistency of two scans
-FEWEST_POINTS = 20  # by hand: of a kind, below which a share of them means nothing
+FEWEST_POINTS = 20  # by hand: of a kind, or cells, below which a share of them means nothing
 COUNTERPART_M, COUNTERPART_SPACINGS = 0.05, 0.5  # measured: .3 m and 1 spacing tell places apart less well
 BLUR_M = 0.04  # by hand: a metre per second in a scan of a tenth to a fifth of one, whose motion was not removed
 UNEXPLAINED = 2.0  # measured: in these reaches; of all measures the most alike from one kind of place to another
-UPRIGHT = 0.7  # geometry: surfaces steeper than 45 deg
-NO_FIT_M = 0.3  # stands for the residual where nothing overlaps
 MAX_MISFIT = 2.5  # measured: of 2,400 right poses one in 100 has more than 1.5, of wrong ones half have more than this
 
 # ambiguity: would the scans fit as well elsewhere?
 RIVAL_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: beyond the error of a right pose, within a wrong one's
 RIVAL_FAR_M = np.concatenate([np.arange(-6.0, -0.9, 0.5), np.arange(1.0, 6.1, 0.5)])  # geometry: what repeats: doors
-RIVAL_EVERY = 10  # of the sample: bounds the time
 RIVAL_MISFIT, MISFIT_FLOOR = 3.0, 0.05  # by hand: the worst misfit, in counterparts' reach, and what counts as none
-RUNNER_UP_ROOM = 0.02  # by hand: shares nearer to nothing than this are alike
 MIN_RUNNER_UP = 0.1  # measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 86
 
 # passages: corridors, tunnels, aisles, canyons, where a scan looks the same all along
-BAND_DEG = 2.0  # geometry: elevations about one ring of sixteen
-PLANE_NEIGHBOURS, PLANE_REACH_M = 8, 0.8  # measured: 12 neighbours leave next to no planes of sixteen rings
+PLANE_REACH_M = 0.8  # by hand: wider neighbourhoods are no surface
 PLANE_WIDTH_M, PLANE_ROUNDNESS = 0.1, 0.45  # by hand: narrower neighbourhoods lie on a single ring
 PLANE_THICKNESS_M = 0.04  # by hand: twice the noise of a range
 PLANE_SIGMA_M = 0.1  # measured: .05 and .2 m tell right poses from wrong ones less well
@@ -135,9 +112,7 @@ PASSAGE_RIVAL, SELF_RIVAL = 0.26, 0.77
 
 # temporal memory
 MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of keyframes
-ODOMETRY_REACH_M = 15.0  # by hand: odometry is trusted over this distance
-EXPECTED_M = 4.0  # by hand: a candidate this near to where odometry carries an accepted closure is tested first
-AGREE_M, AGREE_RAD = 0.5, 0.05  # by hand: two findings this near are one
+ODOMETRY_REACH_M = 20.0  # measured: path over which odometry is trusted, and scans are merged; 10 finds less
 PRIOR_M = 1.0  # by hand: standard deviation of what odometry predicts before any way is driven
 
 # submaps of narrow sensors, judged by their terrain
@@ -146,25 +121,19 @@ MIN_TERRAIN = 0.3  # by hand: correlation of the terrain without which submaps o
 NARROW_DEG = 270.0  # geometry: a sensor that sees more recognises a place from any side by its scans
 
 # submaps: what is seen on the metres around a keyframe
-SUBMAP_BEFORE_M, SUBMAP_AFTER_M = 20.0, 15.0  # measured: path before and behind a keyframe; 10 and 10 find less
 MERGE_STEP_M = 1.5  # measured: between the scans that are merged; 1 and 2 m are as good
 ENOUGH_SEEN, MOST_SEEN = 0.6, 0.85  # of what all these scans show nearby: one scan is enough, and where merging stops
 MERGED_POINTS = 12_000  # measured: 8,000 find less, 16,000 hardly more
-MAX_BLUR_M = (
-    0.3  # by hand: standard deviation by which a merged point may lie beside its place: half a cell of the maps
-)
-NEED_ASKED_EVERY = 4  # anchors; by hand: bounds the time for a sensor that needs none
-SUBMAP_NEAR_M = 5.0  # by hand: from where odometry expects the rover to a keyframe that is compared
+MAX_BLUR_M = 0.3  # by hand: half a cell of the maps: standard deviation by which a merged point may be off
 PROMISING = 0.05  # by hand: probability of a scan's hypothesis from which on submaps are compared
-# by hand: scans that the drift of odometry is judged by, at least and at most, and their overlap with those before
-DRIFT_KNOWN, DRIFT_STEPS, DRIFT_OVERLAP = 6, 24, 0.7
-SUBMAPS_KEPT = 12  # submaps in memory: bounds it, changes no result
+DRIFT_KNOWN, DRIFT_STEPS = 6, 24  # by hand: scans that the drift of odometry is judged by, at least and at most
 ODOMETRY_ALONE_M = 80.0  # by hand: path over which odometry without a closure is worth a look
-ASKED_EVERY_M = 2.0  # by hand: way between two searches for what looks alike; bounds the time
-DESCRIBED_ANCHORS = 2  # by hand: every second anchor can be found by its looks
-LOOKALIKES = 2  # that get a metric pose; bounds the time
+DESCRIBED_EVERY = 2  # of the keyframes that are merged; by hand: bounds the time
+LOOKALIKES, SUBMAPS_COMPARED = (
+    2,
+    10,
+)  # that get a pose; measured: of the most voted for, where four of five right ones are
 KEYPOINTS, KEYPOINT_CONTRAST = 120, 0.01  # measured: 80 and .02 find less
 MIN_KEYPOINTS = 4  # by hand: two of them make a motion, and two more confirm it
-KEYPOINT_M, KEYPOINT_SCALE = 1.0, 0.1  # geometry: two cells; odometry that is off by a tenth is useless
+KEYPOINT_SCALE = 0.1  # by hand: odometry that is off by a tenth is useless
 KEYPOINT_VOTES = 15  # measured: stored keypoints that each of the query's votes for
-SUBMAPS_COMPARED = 10  # measured: the right one is among the ten most voted for in four of five

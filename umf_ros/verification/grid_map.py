@@ -52,12 +52,12 @@ class GridMap:
         self.relief = relief_of(mean, np.isfinite(self.lowest), cell_m)
         centres = (np.column_stack([self.rows, self.columns]) - side // 2 + 0.5) * cell_m
         self.cells: Array = np.column_stack([centres, mean[self.rows, self.columns]])
-        layer = np.floor((points[:, 2] - bottom[cell]) / const.LAYER_M).astype(int)
+        layer = np.floor((points[:, 2] - bottom[cell]) / const.THIN_CELL_M).astype(int)
         filled = np.zeros((side * side, layer.max(initial=0) + 1), bool)
         filled[cell, layer] = True
         # layers above its lowest point in which a cell has points: 1 on any ground but a steep one
         self._layers = filled[occupied].sum(axis=1).astype(float)
-        self.structured = bool((self._layers >= const.TALL_LAYERS).sum() >= const.MIN_TALL)
+        self.structured = bool((self._layers >= const.TALL_LAYERS).sum() >= const.FEWEST_POINTS)
 
     def look_up(self, layer: Array, places: Array) -> Array:
         """(N,) values of a layer (side, side) of the map under places (N, >= 2), m; NaN outside it."""
@@ -116,7 +116,7 @@ def terrain_fit(match: GridMap, query: GridMap, pose: Array) -> tuple[float, flo
     theirs = match.look_up(match.relief, transform(pose, query.cells))
     shared = np.isfinite(theirs) & np.isfinite(ours)
     ours, theirs = ours[shared].astype(float), theirs[shared]
-    if len(ours) < const.MIN_CELLS / 2:
+    if len(ours) < const.FEWEST_POINTS:
         return 0.0, 0.0, float(theirs.std()) if len(theirs) else 0.0
     norm = float(np.sqrt((ours**2).sum() * (theirs**2).sum()))
     correlation = float((ours * theirs).sum()) / max(norm, 1e-9)
@@ -142,7 +142,7 @@ def relief_of(height: Array, known: NDArray[np.bool_], cell_m: float) -> Grid:
     def mean(values: Array) -> Grid:
         return _blur(mask * values.astype(np.float32)) / weight
 
-    ridge = const.PLANE_RIDGE_CELLS2 * cell_m**2
+    ridge = cell_m**2  # keeps the slope finite where the neighbours lie on a line
     mean_x, mean_y, mean_z = mean(x), mean(y), mean(height)
     xx, yy = mean(x * x) - mean_x**2 + ridge, mean(y * y) - mean_y**2 + ridge
     xy = mean(x * y) - mean_x * mean_y
@@ -151,7 +151,7 @@ def relief_of(height: Array, known: NDArray[np.bool_], cell_m: float) -> Grid:
     plane = mean_z + (xz * yy - yz * xy) / determinant * (x - mean_x) + (yz * xx - xz * xy) / determinant * (y - mean_y)
     highest = const.MAX_RELIEF_CELLS * cell_m
     relief = np.clip(height - plane, -highest, highest)
-    return np.where(known & (weight > const.MIN_NEIGHBOURHOOD), relief, np.nan).astype(np.float32)
+    return np.where(known & (weight > const.KNOWN_NEIGHBOURHOOD), relief, np.nan).astype(np.float32)
 
 
 def _blur(values: Grid) -> Grid:

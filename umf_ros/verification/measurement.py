@@ -80,8 +80,8 @@ def runner_up(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> dict[str,
     distinct = [_missing(one) for one in others if not near(pose, one.pose, const.DISTINCT_M, const.DISTINCT_RAD)]
     if hypothesis.kind == IMAGE or not distinct:
         return {}
-    room = const.RUNNER_UP_ROOM
-    return {"runner_up": math.log((min(distinct) + room) / (_missing(hypothesis) + room))}
+    floor = const.MISFIT_FLOOR
+    return {"runner_up": math.log((min(distinct) + floor) / (_missing(hypothesis) + floor))}
 
 
 def _missing(hypothesis: Hypothesis) -> float:
@@ -106,7 +106,7 @@ def _measure_scans(alignment: Alignment, match: PreparedScan, query: PreparedSca
     if match.narrow or query.narrow:
         beside = [terrain_fit(match.terrain, query.terrain, move @ level)[0] for move in _BESIDE]
         rival = {"terrain_rival": max(beside)}
-    size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.NO_FIT_M)
+    size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.FINE_REACH_M)
     return {
         "residual_m": float(np.median(size)),
         "residual_p90_m": float(np.percentile(size, 90)),

@@ -1,4 +1,4 @@
-"""Poses for a candidate: from maps, from local features, and from findings of earlier keyframes."""
+"""Poses for a candidate: from maps, from images where scans tell nothing, and from findings of earlier keyframes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from umf_ros.core.geometry import Array, near, relative
 from umf_ros.verification import constants as const
 from umf_ros.verification.hypothesis import Hypothesis
 from umf_ros.verification.prepared_scan import PreparedScan, views_decide
-from umf_ros.verification.rerank import fit_rigid
 from umf_ros.verification.view_alignment import PairedViews
 from umf_ros.verification.yaw_search import Fit, RotatedMaps, coarse_align, search
 
@@ -39,40 +38,28 @@ def find_hypotheses(
         settings: RANSAC iterations and seed.
         guess: `match_T_query` (4, 4) as odometry has it.
     """
-    views = None
-    if settings.modalities != "cloud":
-        views = PairedViews.of(query, keyframe, const.VIEW_NOISE[settings.features])
-    if turned is None or not match.usable or (views is not None and views_decide(match, turned.scan)):
+    if turned is None or views_decide(match, turned.scan):
+        views = paired_views(query, keyframe, settings)
         seen = views.best_pose() if views else None
-        return [Hypothesis.of(query, candidate, keyframe, pose=seen[0], score=seen[1], views=views)] if seen else []
-    guesses = _pose_from_features(query, candidate, keyframe, settings), views.any_pose() if views else None
-    fits = [coarse_align(match, turned.scan, pose) for pose in guesses if pose is not None]
-    fits = [fit for fit in fits if fit.telling] + search(match, turned)
-    fits.sort(key=lambda fit: -fit.score)
+        if seen is not None:
+            return [Hypothesis.of(query, candidate, keyframe, pose=seen[0], score=seen[1], views=views)]
+        if turned is None or not match.usable or views is not None:
+            return []
+    fits = search(match, turned)
     if guess is not None and (fit := coarse_align(match, turned.scan, guess)).telling:
         fits.insert(0, replace(fit, share=1.0))  # submaps that share little would not rank it first
     distinct: list[Fit] = []
     for fit in fits:
         if not any(near(fit.pose, other.pose, const.DISTINCT_M, const.DISTINCT_RAD) for other in distinct):
             distinct.append(fit)
-    return [Hypothesis.of(query, candidate, keyframe, pose=fit.pose, score=fit.score, views=views) for fit in distinct]
+    return [Hypothesis.of(query, candidate, keyframe, pose=fit.pose, score=fit.score) for fit in distinct]
 
 
-def _pose_from_features(query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification) -> Array | None:
-    """`match_T_query` from 3-D/3-D pairs of both modalities at once, or None."""
-    ours, theirs = [np.empty((0, 3))], [np.empty((0, 3))]
-    for mine, other, pairs in (
-        (query.embedding.image, match.embedding.image, candidate.image_pairs),
-        (query.embedding.cloud, match.embedding.cloud, candidate.cloud_pairs),
-    ):
-        if mine is not None and other is not None:
-            a, b = mine.points[pairs[:, 0]].astype(float), other.points[pairs[:, 1]].astype(float)
-            known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
-            ours.append(a[known])
-            theirs.append(b[known])
-    points = np.concatenate(ours), np.concatenate(theirs)
-    consensus = fit_rigid(*points, const.POINT_THRESHOLD_M, settings.ransac_iterations, settings.seed)
-    return consensus.model if consensus is not None and consensus.count >= const.MIN_POINTS else None
+def paired_views(query: Keyframe, match: Keyframe, settings: Verification) -> PairedViews | None:
+    """Both images with their paired features; None without any."""
+    if settings.modalities == "cloud":
+        return None
+    return PairedViews.of(query, match, const.VIEW_NOISE[settings.features])
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +90,7 @@ class TemporalMemory:
         """The candidate nearest to where earlier closures and odometry put the rover, if there is one within 4 m."""
         distances = [self._expected_distance(query, keyframe) for _, keyframe in candidates]
         nearest = int(np.argmin(distances)) if distances else 0
-        return [candidates[nearest]] if distances and distances[nearest] < const.EXPECTED_M else []
+        return [candidates[nearest]] if distances and distances[nearest] < const.SAME_PLACE_M else []
 
     def _expected_distance(self, query: Keyframe, match: Keyframe) -> float:
         """Metres between a pair, as odometry carries it over from the latest accepted closure near it; or inf."""
@@ -118,7 +105,7 @@ class TemporalMemory:
 
         def agrees(finding: _Finding) -> bool:
             carried = _carried(finding, query, match)
-            return carried is not None and near(carried, match_T_query, const.AGREE_M, const.AGREE_RAD)
+            return carried is not None and near(carried, match_T_query, const.DISTINCT_M, const.DISTINCT_RAD)
 
         return float(sum(any(map(agrees, findings)) for findings in self._findings))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cached_property
+from zlib import crc32
 
 import numpy as np
 import small_gicp
@@ -130,7 +131,7 @@ class PreparedScan:
         """Make at once what a query's scan is asked for in every comparison."""
         if self.usable:
             self.map(self.cell_m)
-            for part in ("view", "terrain", "range_images", "spacing", "scouts_cloud", "coarse_cloud", "sample_cloud"):
+            for part in ("view", "terrain", "range_images", "spacing", "scouts_cloud", "sample_cloud"):
                 getattr(self, part)
 
     @property
@@ -147,6 +148,11 @@ class PreparedScan:
     def up(self) -> Array:
         """Rotation (3, 3) that sets the scan upright."""
         return upright(self.normals[self.picks])
+
+    @property
+    def upright_T_body(self) -> Array:
+        """The same as a pose (4, 4)."""
+        return make_pose(self.up, np.zeros(3))
 
     @cached_property
     def upright_points(self) -> Array:
@@ -175,7 +181,7 @@ class PreparedScan:
     @cached_property
     def terrain(self) -> GridMap:
         """Map of the relief out to 26 m, in cells in which rocks and ripples are seen at any range."""
-        return GridMap(self.upright_points, const.TERRAIN_CELL_M, const.TERRAIN_RADIUS)
+        return GridMap(self.upright_points, const.TERRAIN_CELL_M, 2 * const.MAP_RADIUS)
 
     @cached_property
     def range_images(self) -> list[RangeImage]:
@@ -216,13 +222,10 @@ class PreparedScan:
         """(M, 3) unit normals, zero where the neighbourhood is too small."""
         return np.asarray(self.cloud.normals())[:, :3]
 
-    def _pick(self, count: int) -> Indices:
-        return np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(np.intp)
-
     @cached_property
     def picks(self) -> Indices:
         """(S,) indices of at most 1500 points, evenly taken."""
-        return self._pick(const.SAMPLE)
+        return np.linspace(0, len(self.points) - 1, min(const.SAMPLE, len(self.points))).astype(np.intp)
 
     @cached_property
     def sample(self) -> Array:
@@ -234,15 +237,10 @@ class PreparedScan:
         """The sample with covariances of its own."""
         return _cloud_of(self.sample)
 
-    @cached_property
-    def coarse_cloud(self) -> small_gicp.PointCloud:
-        """A third of the sample, likewise: enough for the far-sighted steps."""
-        return _cloud_of(self.sample[:: const.COARSE_EVERY])
-
-    @cached_property
+    @property
     def scouts(self) -> Array:
-        """(S, 3) m: a few hundred points, evenly taken."""
-        return self.points[self._pick(const.SCOUTS)]
+        """(S / 5, 3) m: every fifth of the sample, enough for the far-sighted steps."""
+        return self.sample[:: const.SCOUT_EVERY]
 
     @cached_property
     def scouts_cloud(self) -> small_gicp.PointCloud:
@@ -270,26 +268,20 @@ class PreparedScan:
         poses = self._lidars_T_body[self._owner]
         seen = np.einsum("nij,nj->ni", poses[:, :3, :3], self.points) + poses[:, :3, 3]
         elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
-        odd = (np.floor(elevation / const.BAND_DEG) % 2).astype(bool)
+        odd = (np.floor(elevation / const.SIGHT_DEG) % 2).astype(bool)
         return Surfaces.of(self.points[~odd]), Surfaces.of(self.points[odd])
 
 
 def _cloud_of(points: Array, tree: small_gicp.KdTree | None = None) -> small_gicp.PointCloud:
     """Points (N, 3) with normals and covariances of their own."""
     cloud = small_gicp.PointCloud(points)
-    small_gicp.estimate_normals_covariances(cloud, tree, const.NORMAL_NEIGHBOURS, 1)
+    small_gicp.estimate_normals_covariances(cloud, tree, 2 * const.NEIGHBOURS, 1)
     return cloud
 
 
 def levelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
     """The pose `match_T_query` (4, 4) between the upright frames of two scans."""
-    found: Array = make_pose(match.up, np.zeros(3)) @ pose @ make_pose(query.up.T, np.zeros(3))
-    return found
-
-
-def unlevelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
-    """The pose `match_T_query` (4, 4) that is this one between the upright frames of two scans."""
-    found: Array = make_pose(match.up.T, np.zeros(3)) @ pose @ make_pose(query.up, np.zeros(3))
+    found: Array = match.upright_T_body @ pose @ invert(query.upright_T_body)
     return found
 
 
@@ -307,10 +299,11 @@ class ScanCache:
     """The most recently used scans; a cache, so it changes no result."""
 
     def __init__(self) -> None:
-        self._scans: OrderedDict[tuple[int, int], PreparedScan] = OrderedDict()
+        self._scans: OrderedDict[tuple[int, int, int], PreparedScan] = OrderedDict()
 
     def __getitem__(self, keyframe: Keyframe) -> PreparedScan:
-        key = (keyframe.session, keyframe.stamp_ns)
+        # submaps of one keyframe differ by how far they reach
+        key = keyframe.session, keyframe.stamp_ns, crc32(keyframe.points.tobytes())
         scan = self._scans.pop(key, None) or PreparedScan.of(keyframe)
         self._scans[key] = scan
         if len(self._scans) > const.SCANS_KEPT:

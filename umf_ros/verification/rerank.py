@@ -85,7 +85,6 @@ def fit_rigid(a: Array, b: Array, threshold: float, iterations: int, seed: int) 
 
 Indices = NDArray[np.intp]
 Fit = Callable[[Array, Array, float, int, int], Consensus | None]
-NO_PAIRS: Indices = np.empty((0, 2), np.intp)
 WITHOUT: dict[str, Any] = {
     "both": {},
     "image": {"cloud": None, "super_cloud": None},
@@ -157,7 +156,7 @@ def similarities(query: NDArray[Any], match: NDArray[Any]) -> NDArray[np.float32
 def mutual_neighbours(similarity: NDArray[Any]) -> Indices:
     """Pairs (P, 2) of row and column of a matrix (Q, M), which may be empty, that are each other's most similar."""
     if 0 in similarity.shape:
-        return NO_PAIRS
+        return np.empty((0, 2), np.intp)
     best_column = similarity.argmax(axis=1)
     best_row = similarity.argmax(axis=0)
     rows = np.flatnonzero(best_row[best_column] == np.arange(len(similarity)))
@@ -192,24 +191,24 @@ def _by_superfeatures(query: Keyframe, candidate: Candidate, match: Keyframe, se
 def _by_ransac(query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification) -> Candidate:
     ours, theirs = query.embedding, match.embedding
     reach = const.IMAGE_THRESHOLD * query.camera.width
-    image_pairs, image = _explain(ours.image, theirs.image, fit_homography, reach, settings)
-    cloud_pairs, cloud = _explain(ours.cloud, theirs.cloud, fit_rigid, const.POINT_THRESHOLD_M, settings)
+    image = _explain(ours.image, theirs.image, fit_homography, reach, settings)
+    cloud = _explain(ours.cloud, theirs.cloud, fit_rigid, const.POINT_THRESHOLD_M, settings)
     ratio = score(candidate.similarity, {settings.features: image, "cloud": cloud})
-    found = replace(candidate, image_pairs=image_pairs, cloud_pairs=cloud_pairs, score=ratio)
-    return replace(found, inliers_image=float(image or 0), inliers_cloud=float(cloud or 0), superfeatures=0.0)
+    found = replace(candidate, inliers_image=float(image or 0), inliers_cloud=float(cloud or 0))
+    return replace(found, superfeatures=0.0, score=ratio)
 
 
 def _explain(
     query: LocalFeatures | None, match: LocalFeatures | None, fit: Fit, threshold: float, settings: Verification
-) -> tuple[Indices, int | None]:
-    """Mutual neighbours among the strongest features, and how many one model explains; None if a side has none."""
+) -> int | None:
+    """How many mutual neighbours among the strongest features one model explains; None if a side has none."""
     if query is None or match is None or 0 in (len(query.positions), len(match.positions)):
-        return NO_PAIRS, None
+        return None
     query, match = strongest(query, settings.rerank_features), strongest(match, settings.rerank_features)
     pairs = mutual_neighbours(similarities(query.descriptors, match.descriptors))
     here, there = query.positions[pairs[:, 0]].astype(float), match.positions[pairs[:, 1]].astype(float)
     found = fit(here, there, threshold, settings.ransac_iterations, settings.seed)
-    return pairs, int(found.inliers.sum()) if found else 0
+    return found.count if found else 0
 
 
 def _same_place(a: Keyframe, b: Keyframe) -> bool:

@@ -54,7 +54,7 @@ def _diagonal(metres: float, degrees: float) -> Array:
 
 # information (6, 6) of the search itself: nothing is less known than that
 SEARCHED = np.diag([const.SEARCH_M**-2] * 3 + [const.SEARCH_RAD**-2] * 3)
-NOMINAL = CovarianceModel(const.NOMINAL_INFLATION, const.NOMINAL_FLOOR_M, const.NOMINAL_FLOOR_DEG)
+NOMINAL = CovarianceModel(const.NOMINAL_INFLATION, 0.0, 0.0)
 """A fixed yardstick of what a pose is known to: refitting the covariance must not move the decision."""
 
 
@@ -96,12 +96,12 @@ class Alignment:
 
 def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Alignment:
     """Generalised ICP (Segal, RSS 2009) from the pose `guess`, first far-sighted, then near-sighted."""
-    pose = run_gicp(match, query.coarse_cloud, guess, const.COARSE_REACH_M, const.COARSE_STEPS)
-    pose = run_gicp(match, query.sample_cloud, pose, const.FINE_REACH_M, const.FINE_STEPS)
+    pose = run_gicp(match, query.sample_cloud, guess, const.COARSE_REACH_M)
+    pose = run_gicp(match, query.sample_cloud, pose, const.FINE_REACH_M)
     return inspect(match, query, pose)
 
 
-def run_gicp(match: PreparedScan, query: small_gicp.PointCloud, guess: Array, reach_m: float, steps: int) -> Array:
+def run_gicp(match: PreparedScan, query: small_gicp.PointCloud, guess: Array, reach_m: float) -> Array:
     """`match_T_query` after some steps of generalised ICP from a guess; counterparts are nearer than `reach_m`."""
     result = small_gicp.align(
         match.cloud,
@@ -111,7 +111,7 @@ def run_gicp(match: PreparedScan, query: small_gicp.PointCloud, guess: Array, re
         registration_type="GICP",
         max_correspondence_distance=reach_m,
         num_threads=1,
-        max_iterations=steps,
+        max_iterations=const.STEPS,
     )
     return np.asarray(result.T_target_source)
 

@@ -57,9 +57,9 @@ def counterpart_reach(spacing: Array, blur_m: float) -> Array:
 
 
 def _upright(scan: PreparedScan, index: NDArray[np.intp]) -> Mask:
-    """(N,) whether the surfaces at these points of a scan stand; those without a normal do not."""
+    """(N,) whether the surfaces at these points of a scan are steeper than 45 deg; those without a normal do not."""
     normals = scan.normals[index]
-    return (np.abs(normals @ scan.up[2]) < const.UPRIGHT) & (np.einsum("ij,ij->i", normals, normals) > 0.5)
+    return (2 * (normals @ scan.up[2]) ** 2 < 1.0) & (np.einsum("ij,ij->i", normals, normals) > 0.5)
 
 
 def _share(what: Mask, of: Mask, otherwise: float) -> float:

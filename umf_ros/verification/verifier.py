@@ -17,8 +17,8 @@ from umf_ros.verification.acceptance import load_acceptance, refuted
 from umf_ros.verification.ambiguity import ambiguity, passage_rival
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
-from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses, prior_sigmas
-from umf_ros.verification.prepared_scan import ScanCache, views_decide
+from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses, paired_views, prior_sigmas
+from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans
 from umf_ros.verification.yaw_search import RotatedMaps
@@ -29,10 +29,10 @@ NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 class Verifier:
     """Decides which candidates of a query are the same place, and where the rover stood.
 
-    Candidates are reranked by their local features; the best get hypotheses from maps and features; the best
-    hypotheses are aligned scan to scan and judged by one calibrated probability. Every step is seeded and runs on one
-    thread, so the verdicts do not depend on the machine. The only memory is of what the last few keyframes found
-    (`reset` forgets it); keyframes must come in order.
+    Candidates are reranked by their local features; the best get hypotheses from their maps, or from their images where
+    scans tell nothing; the best hypotheses are aligned and judged by one calibrated probability. Every step is seeded
+    and runs on one thread, so the verdicts do not depend on the machine. The only memory is of what the last few
+    keyframes found (`reset` forgets it); keyframes must come in order.
 
     Args:
         settings: the verification group of the settings.
@@ -113,7 +113,7 @@ class Verifier:
         """The best hypotheses about some candidates, judged."""
         with self._timed("refine"):
             hypotheses = self._hypotheses(query, ranked, turned, guesses)[: const.MAX_REFINED]
-            return self._judge(hypotheses, min(const.HOPELESS, self._settings.min_probability))
+            return self._judge(hypotheses, self._settings.min_probability)
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -138,7 +138,7 @@ class Verifier:
             found += find_hypotheses(query, candidate, keyframe, turned, scan, self._settings, guess)
         return sorted(found, key=lambda one: -one.score)
 
-    def _judge(self, hypotheses: list[Hypothesis], hopeless: float) -> list[Hypothesis]:
+    def _judge(self, hypotheses: list[Hypothesis], least: float) -> list[Hypothesis]:
         """Align and measure hypotheses, and judge each beside the others about its candidate.
 
         The slow tests are left out where they cannot change the decision.
@@ -151,7 +151,7 @@ class Verifier:
             one.measurements |= measure(one) | known_only({"prior_sigmas": prior, "support": support})
         for one in aligned:
             one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
-            if one.scans and self._acceptance.at_best(one.measurements) >= hopeless:
+            if one.scans and self._acceptance.at_best(one.measurements) >= least:
                 assert one.alignment is not None
                 theirs, ours = one.scans
                 one.measurements |= ambiguity(theirs, ours, one.pose, one.alignment.information)
@@ -176,17 +176,16 @@ class Verifier:
         kept: list[Hypothesis] = []
         for one in hypotheses:
             ends = [other.pose for other in kept if other.candidate is one.candidate]
-            if any(near(one.pose, end, const.DISTINCT_M, const.DISTINCT_RAD) for end in ends):
-                continue
-            self._align(one)
-            if not any(near(one.pose, end, const.SAME_M, const.SAME_RAD) for end in ends):
-                kept.append(one)
+            if not _ends_at(one, ends):
+                self._align(one)
+                if not _ends_at(one, ends):
+                    kept.append(one)
         return kept
 
     def _align(self, hypothesis: Hypothesis) -> None:
         query, match = hypothesis.keyframes
         scans = self._scans[match], self._scans[query]
-        if hypothesis.views is not None and views_decide(*scans):
+        if hypothesis.views is not None:
             hypothesis.alignment = hypothesis.views.align(hypothesis.pose)
         else:
             hypothesis.scans, hypothesis.alignment = scans, align_scans(*scans, hypothesis.pose)
@@ -214,8 +213,10 @@ class Verifier:
 
     def _decide(self, hypothesis: Hypothesis) -> None:
         """Set the closure, or the reason why there is none."""
-        if hypothesis.views is not None:
-            hypothesis.inlier_pixels = hypothesis.views.consistent_pixels(hypothesis.pose)
+        query, match = hypothesis.keyframes
+        views = hypothesis.views or paired_views(query, match, self._settings)
+        if views is not None:
+            hypothesis.inlier_pixels = views.consistent_pixels(hypothesis.pose)
         if (objection := self._objection(hypothesis)) is not None:
             hypothesis.reject(*objection)
             return
@@ -239,3 +240,7 @@ class Verifier:
         if 0 < self._settings.max_shift_m < shift_m:
             return RejectReason.TOO_FAR, f"{shift_m:.1f} m > {self._settings.max_shift_m:g}"
         return None
+
+
+def _ends_at(hypothesis: Hypothesis, poses: list[Array]) -> bool:
+    return any(near(hypothesis.pose, pose, const.DISTINCT_M, const.DISTINCT_RAD) for pose in poses)

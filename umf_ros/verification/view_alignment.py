@@ -50,7 +50,7 @@ class CameraView:
         points = features.points[rows].astype(float)
         disparity = _disparity(keyframe.camera, keyframe.camera.project(points, keyframe.body_T_camera)[1])
         measured = np.column_stack([features.positions[rows].astype(float), disparity])
-        sides = keyframe.camera.width * np.array([noise, noise, max(const.DISPARITY_NOISE, noise / 3)])
+        sides = keyframe.camera.width * np.array([noise, noise, noise / 3])
         return cls(keyframe.camera, sides, keyframe.body_T_camera, points, measured)
 
     @cached_property
@@ -66,7 +66,7 @@ class CameraView:
         """
         camera, rotation = self.camera, invert(self.body_T_camera)[:3, :3]
         optical = transform(invert(self.body_T_camera), points)
-        front = optical[:, 2] > const.NEAREST_SEEN_M  # False for NaN
+        front = optical[:, 2] > const.SIGHT_FROM_M  # False for NaN
         x, y, z = np.where(front[:, None], optical, 1.0).T
         zero = np.zeros_like(z)
         disparity = _disparity(camera, z)
@@ -88,7 +88,7 @@ class CameraView:
             return None
         camera = other.camera
         options = cv2.UsacParams()
-        options.threshold = const.VIEW_REACH * float(other.noise[0])
+        options.threshold = float(np.sqrt(const.VIEW_GATE) * other.noise[0])
         options.maxIterations = const.VIEW_SAMPLES
         options.confidence = 0.999
         options.isParallel = False  # the same on every machine
@@ -140,7 +140,7 @@ class ViewAlignment:
         if not len(self.residuals):
             return np.zeros((6, 6))
         whole = np.einsum("n,nki,nkj->ij", _weight(self.residuals), self.jacobian, self.jacobian)
-        whole = whole / max(self.spread_sigmas, const.MIN_VIEW_SIGMAS) ** 2
+        whole = whole / self.spread_sigmas**2
         found: Array = whole[:6, :6] - np.outer(whole[:6, 6], whole[6, :6]) / (whole[6, 6] + 1.0)
         return found
 
@@ -190,20 +190,12 @@ class PairedViews:
         found = self.match.locate(self.query)
         return None if found is None else invert(found)
 
-    def any_pose(self) -> Array | None:
-        """A pose that enough features agree with: a guess where scans decide."""
-        # by the depths of the source; the other way round finds next to nothing more
-        pose = self.forward if self._from_query else self.backward
-        return pose if self._agreeing(pose) >= const.MIN_PIXELS else None
-
     def best_pose(self) -> tuple[Array, int] | None:
         """The pose that more features agree with, and how many do; None where too few do."""
-        counted = [(pose, self._agreeing(pose)) for pose in (self.forward, self.backward) if pose is not None]
+        poses = [pose for pose in (self.forward, self.backward) if pose is not None]
+        counted = [(pose, int(self._compare(pose).agreeing.sum())) for pose in poses]
         best = max(counted, key=lambda one: one[1], default=None)
         return best if best is not None and best[1] >= const.MIN_PIXELS else None
-
-    def _agreeing(self, pose: Array | None) -> int:
-        return 0 if pose is None else int(self._compare(pose).agreeing.sum())
 
     def consistent_pixels(self, pose: Array) -> Points:
         """Pixels (K, 4) float32 in the query's and in the match's image of the pairs that agree with a pose."""
@@ -212,17 +204,15 @@ class PairedViews:
 
     def align(self, guess: Array) -> ViewAlignment:
         """Refine the pose `guess` by Gauss-Newton on reprojections, outliers weighted down."""
-        near, pose = self._compare(guess).near, guess
-        for _ in range(const.VIEW_STEPS):
-            step, _ = _solve(self._compare(pose), near)
+        pose = guess
+        for _ in range(const.STEPS):
+            step, _ = _solve(self._compare(pose))
             turn = Rotation.from_rotvec(step[3:]).as_matrix()
             pose = make_pose(turn @ pose[:3, :3], pose[:3, 3] + step[:3])
-            if float(np.abs(step).max()) < const.VIEW_TOLERANCE:
-                break
         fit = self._compare(pose)
-        bias = _solve(fit, near)[1]
+        bias = _solve(fit)[1]
         fit = fit.without_bias(bias)
-        agree = fit.agreeing & near
+        agree = fit.agreeing
         both = agree & self.query.lifted & self.match.lifted
         gaps = transform(pose, self.query.points[both]) - self.match.points[both]
         return ViewAlignment(
@@ -256,8 +246,8 @@ class PairedViews:
         residual = np.where(usable[:, None], predicted - target.measured, 0.0)
         unmeasured = ~np.isfinite(residual[:, 2])
         residual[unmeasured, 2] = 0.0
-        covariance[unmeasured, 2, 2] += const.UNMEASURED
         whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+        whiten[unmeasured, 2] = 0.0  # a disparity that was not measured says nothing
         arms = np.where(usable[:, None], source.points, 0.0) @ target_T_source[:3, :3].T
         by_pose = derivative @ np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], axis=2)
         if not self._from_query:  # errors of `match_T_query` as errors of its inverse
@@ -287,17 +277,12 @@ class _Fit:
         """(N,) nearer than 99 % of right ones are."""
         return self.usable & ((self.residuals**2).sum(axis=1) < const.VIEW_GATE)
 
-    @property
-    def near(self) -> Mask:
-        """(N,) near enough to be refined by."""
-        return self.usable & ((self.residuals**2).sum(axis=1) < const.VIEW_NEAR)
 
-
-def _solve(fit: _Fit, rows: Mask) -> tuple[Array, float]:
+def _solve(fit: _Fit) -> tuple[Array, float]:
     """Step (6,) of the pose and bias of the disparities, in prior standard deviations, with the least residuals."""
     bias = 0.0
     for _ in range(2):  # outliers are told by the residuals that the bias leaves
-        weight = np.where(fit.usable & rows, _weight(fit.without_bias(bias).residuals), 0.0)
+        weight = np.where(fit.usable, _weight(fit.without_bias(bias).residuals), 0.0)
         normal = np.einsum("n,nki,nkj->ij", weight, fit.jacobian, fit.jacobian)
         slope = np.einsum("n,nki,nk->i", weight, fit.jacobian, fit.residuals)
         solution = -np.linalg.solve(normal + np.diag([1e-6] * 6 + [1.0]), slope)
@@ -307,7 +292,7 @@ def _solve(fit: _Fit, rows: Mask) -> tuple[Array, float]:
 
 def _weight(residuals: Array) -> Array:
     """(N,) weights: residuals of many standard deviations count next to nothing (Geman-McClure)."""
-    found: Array = 1.0 / (1.0 + (residuals**2).sum(axis=1) / const.VIEW_KERNEL) ** 2
+    found: Array = 1.0 / (1.0 + (residuals**2).sum(axis=1) / const.VIEW_GATE) ** 2
     return found
 
 

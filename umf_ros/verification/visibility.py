@@ -11,6 +11,10 @@ from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 
+_SECTORS = len(const.ALL_HEADINGS)
+_COLUMNS = round(360.0 / const.SIGHT_DEG)
+_ROWS = _COLUMNS // 2
+
 
 class FieldOfView:
     """The bearings into which a scan has points, found from the points themselves.
@@ -21,22 +25,22 @@ class FieldOfView:
     def __init__(self, points: Array) -> None:
         """Args: points (M, >= 2) m, upright, about the sensor."""
         bearing = np.arctan2(points[:, 1], points[:, 0])
-        sector = np.floor((bearing + np.pi) * (const.SECTORS / (2 * np.pi))).astype(int) % const.SECTORS
-        count = np.bincount(sector, minlength=const.SECTORS)
-        self.seen: Array = (count > const.MIN_SECTOR_SHARE * max(len(points), 1)).astype(float)
+        sector = np.floor((bearing + np.pi) * (_SECTORS / (2 * np.pi))).astype(int) % _SECTORS
+        # fewer points in a sector are strays
+        self.seen: Array = (np.bincount(sector, minlength=_SECTORS) >= const.NEIGHBOURS).astype(float)
 
     @property
     def width_deg(self) -> float:
         """Of all directions seen, together, deg."""
-        return float(self.seen.sum()) * 360.0 / const.SECTORS
+        return float(self.seen.sum()) * 360.0 / _SECTORS
 
     def overlap(self, other: FieldOfView, headings: Array) -> Array:
         """Share (H,) of the narrower view that both see, were `other` turned by the headings (H,), rad."""
         spectrum = np.fft.rfft(self.seen) * np.fft.rfft(other.seen).conj()
-        shared = np.append(both := np.fft.irfft(spectrum, const.SECTORS), both[0])
-        steps = np.mod(np.asarray(headings) * (const.SECTORS / (2 * np.pi)), const.SECTORS)
+        shared = np.append(both := np.fft.irfft(spectrum, _SECTORS), both[0])
+        steps = np.mod(np.asarray(headings) * (_SECTORS / (2 * np.pi)), _SECTORS)
         narrower = min(self.seen.sum(), other.seen.sum())
-        share: Array = np.interp(steps, np.arange(const.SECTORS + 1), shared) / max(narrower, 1.0)
+        share: Array = np.interp(steps, np.arange(_SECTORS + 1), shared) / max(narrower, 1.0)
         return share
 
 
@@ -59,14 +63,13 @@ class RangeImage:
     def __init__(self, points: Array) -> None:
         """Args: points (N, 3) m, thinned, sensor at the origin."""
         row, column, reach = _polar(_filled(points))
-        shape = (const.SIGHT_ROWS, const.SIGHT_COLUMNS)
-        nearest, farthest = np.full(shape, np.inf), np.zeros(shape)
+        nearest, farthest = np.full((_ROWS, _COLUMNS), np.inf), np.zeros((_ROWS, _COLUMNS))
         np.minimum.at(nearest, (row, column), reach)
         np.maximum.at(farthest, (row, column), reach)
         around = ("nearest", "wrap")
         self._nearest = minimum_filter(nearest, 3, mode=around)
         self._farthest = maximum_filter(farthest, 3, mode=around)
-        self._known = uniform_filter(np.isfinite(nearest).astype(float), 3, mode=around) > const.SIGHT_KNOWN
+        self._known = uniform_filter(np.isfinite(nearest).astype(float), 3, mode=around) > const.KNOWN_NEIGHBOURHOOD
 
     def look_at(self, points: Array) -> NDArray[np.int8]:
         """(N,) a `Sight` for each of the points (N, 3), given in this image's sensor frame."""
@@ -85,9 +88,9 @@ def visible(sight: NDArray[np.int8]) -> NDArray[np.bool_]:
 
 
 def _filled(points: Array) -> Array:
-    """The points and, near the sensor, some around each: a thinned point stands for a cube that is wider than rays."""
+    """The points and, where the cube that a thinned point stands for is wider than a cell, some around each."""
     reach = np.linalg.norm(points, axis=1, keepdims=True)
-    near = (reach < const.SIGHT_FILLED_M).ravel() & (reach > const.SIGHT_FROM_M).ravel()
+    near = (reach < const.THIN_CELL_M / np.radians(const.SIGHT_DEG)).ravel() & (reach > const.SIGHT_FROM_M).ravel()
     ray = points[near] / reach[near]
     across = np.column_stack([ray[:, 1], -ray[:, 0], np.zeros(len(ray))])
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-6)
@@ -100,6 +103,6 @@ def _polar(points: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
     reach = np.sqrt(np.einsum("ij,ij->i", points, points))
     elevation = np.arcsin(np.clip(points[:, 2] / np.maximum(reach, 1e-6), -1, 1)) / np.pi + 0.5
     azimuth = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
-    row = np.clip((elevation * const.SIGHT_ROWS).astype(np.intp), 0, const.SIGHT_ROWS - 1)
-    column = (azimuth * const.SIGHT_COLUMNS).astype(np.intp) % const.SIGHT_COLUMNS
+    row = np.clip((elevation * _ROWS).astype(np.intp), 0, _ROWS - 1)
+    column = (azimuth * _COLUMNS).astype(np.intp) % _COLUMNS
     return row, column, reach

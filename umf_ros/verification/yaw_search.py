@@ -14,12 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from umf_ros.core.geometry import Array, heading, make_pose, transform
+from umf_ros.core.geometry import Array, heading, invert, make_pose, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import GridMap, Spectra, terrain_fit
-from umf_ros.verification.prepared_scan import PreparedScan, levelled, unlevelled
+from umf_ros.verification.prepared_scan import PreparedScan, levelled
 from umf_ros.verification.scan_alignment import run_gicp
 
 
@@ -72,7 +71,7 @@ def search(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
     overlap = match.view.overlap(turned.scan.view, const.ALL_HEADINGS)
     wanted = np.flatnonzero(overlap >= const.SEARCHED_OVERLAP)
     theirs, ours = match.map(turned.map.cell_m), turned.map
-    if not len(wanted) or min(len(theirs.rows), len(ours.rows)) < const.MIN_CELLS:
+    if not len(wanted) or min(len(theirs.rows), len(ours.rows)) < const.FEWEST_POINTS:
         return []
     fits = []
     for index, shift in _peaks(_correlate(theirs, turned.spectra(wanted)), wanted, const.PEAKS, ours.cell_m):
@@ -98,13 +97,12 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     volumes = _correlate(theirs, ours.turned_spectra(np.array([turn])))
     row, column = np.round(level[:2, 3] / query.cell_m).astype(int) + const.MAP_SHIFT
     volumes[:, :, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
-    peaks = _peaks(volumes, np.zeros(1, np.intp), const.ALTERNATIVES, query.cell_m)
+    peaks = _peaks(volumes, np.zeros(1, np.intp), const.PEAKS // 2, query.cell_m)
     return [_by_scouts(match, query, _lifted(match, query, turn, shift)) for _, shift in peaks]
 
 
 def _by_scouts(match: PreparedScan, query: PreparedScan, guess: Array) -> Array:
-    reach_m = const.SCOUT_REACH * query.cell_m
-    return run_gicp(match, query.scouts_cloud, guess, reach_m, const.SCOUT_STEPS)
+    return run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M)
 
 
 def _correlate(around: GridMap, turned: Spectra) -> NDArray[np.float32]:
@@ -138,21 +136,13 @@ def _peaks(
 
 
 def _lifted(match: PreparedScan, query: PreparedScan, turn: float, shift: Array) -> Array:
-    """`match_T_query` of a planar fit, rad and (2,) m between the upright frames, with the height and tilt it needs."""
+    """`match_T_query` of a planar fit, rad and (2,) m between the upright frames, with the height of the ground."""
     theirs, ours = match.map(query.cell_m), query.map(query.cell_m)
     cos, sin = math.cos(turn), math.sin(turn)
     planar = make_pose(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), [*shift, 0.0])
-    moved = transform(planar, ours.cells)[:, :2]
-    offset = theirs.look_up(theirs.lowest, moved) - ours.lowest[ours.rows, ours.columns]
-    known = np.isfinite(offset)
-    if known.sum() < const.MIN_CELLS / 2:
-        return unlevelled(match, query, planar)
-    design, offset = np.column_stack([np.ones(int(known.sum())), moved[known]]), offset[known]
-    plane = np.array([np.median(offset), 0.0, 0.0])
-    for _ in range(3):  # the plane through the offsets of the ground, without what stands on one map alone
-        residual = np.abs(offset - design @ plane)
-        kept = residual <= const.SETTLE_MEDIANS * np.median(residual) + const.MIN_NOISE_M
-        plane = np.linalg.lstsq(design[kept], offset[kept], rcond=None)[0]
-    lift, slope_x, slope_y = plane
-    tilt = Rotation.from_rotvec(np.clip([slope_y, -slope_x, 0.0], -const.MAX_SLOPE, const.MAX_SLOPE)).as_matrix()
-    return unlevelled(match, query, make_pose(tilt, [0, 0, lift]) @ planar)
+    offset = theirs.look_up(theirs.lowest, transform(planar, ours.cells)) - ours.lowest[ours.rows, ours.columns]
+    known = offset[np.isfinite(offset)]
+    if len(known):
+        planar[2, 3] = np.median(known)
+    lifted: Array = invert(match.upright_T_body) @ planar @ query.upright_T_body
+    return lifted

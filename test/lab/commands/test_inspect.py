@@ -16,6 +16,7 @@ from foreign_messages import HESAI, OUSTER, VELODYNE, compressed, drive, livox, 
 from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, START_NS, Entry, camera_info, header, image, make, traverse
 
 from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.storages import message_types
 from umf_ros.core.config import load_settings
@@ -159,4 +160,67 @@ def test_a_data_set_that_camera_info_contradicts_is_not_recognised(
 ) -> None:
     entries = [*traverse(25.0), ("/stereo/left/camera_info", START_NS + 1, camera_info(START_NS, 50.0, (1242, 375)))]
     ended = umf("inspect", write(tmp_path / "bag.mcap", entries, monkeypatch))
-    assert "data set:" not in ended.text and "1242 x 375 pixels" in ended.text and "--write" in ended.text
+    assert "of the data set" not in ended.text and "1242 x 375 pixels" in ended.text and "--write" in ended.text
+
+
+def vlp_16_and_camera(cameras: tuple[str, ...] = ("/camera",)) -> list[Entry]:
+    """The drive of `traverse` by a rover of no known data set, whose `/tf_static` says how it is built."""
+    camera = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.4, 0.1, 1.2])
+    mounted = {"camera_optical": camera, "velodyne": make_pose(np.eye(3), [0.3, 0.0, 1.3])}
+    tree = make("tf2_msgs/msg/TFMessage", transforms=[transform("base_link", name, pose) for name, pose in mounted.items()])  # noqa: E501  # fmt: skip
+    entries: list[Entry] = [("/tf_static", START_NS, tree)]
+    for topic, at, message in drive(clouds=lambda message: relaid(message, VELODYNE)):
+        if topic.startswith(CLOUD):
+            message.header.frame_id = "velodyne"
+            entries.append(("/velodyne_points", at, message))
+        elif topic == ODOMETRY:
+            entries.append(("/wheels/odometry", at, message))
+        elif topic.startswith(LEFT):
+            message.header.frame_id = "camera_optical"
+            entries += [(f"{name}/image_raw", at, message) for name in cameras]
+    entries += [(f"{name}/camera_info", START_NS + 1, camera_info(START_NS, 50.0, (64, 48))) for name in cameras]
+    return entries
+
+
+def test_a_rover_of_no_data_set_is_replayed_without_a_parameter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = write(tmp_path / "bag.mcap", vlp_16_and_camera(), monkeypatch)
+    line = (
+        "inputs: left_image /camera/image_raw, left_info /camera/camera_info, cloud /velodyne_points, "
+        "odometry /wheels/odometry; not found: topics.right_image, topics.right_info; "
+        "rig: /tf_static and camera_info (parameter calibration)"
+    )
+    ended = umf("replay", bag, "--embedder", "thumbnail", "--out", tmp_path / "runs")
+    assert line in ended.out.splitlines(), ended.text
+    frames = list(FrameReader(open_bag(bag), load_settings(tmp_path / "runs" / "latest" / "config.yaml")))
+    assert len(frames) > 10 and all(frame.points is not None and frame.left is not None for frame in frames[1:-1])
+    assert (frames[5].camera.fx, frames[5].camera.width) == (50.0, 64)
+    np.testing.assert_allclose(frames[5].body_T_lidar[:3, 3], [0.3, 0.0, 1.3])
+    np.testing.assert_allclose(frames[5].body_T_camera[:3, 3], [0.4, 0.1, 1.2], atol=0.01)  # at its own stamp
+    assert f"{line}; umf replay {bag} needs no --config" in umf("inspect", bag).text
+
+
+def test_what_nothing_describes_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    two = write(tmp_path / "two.mcap", vlp_16_and_camera(("/front/camera", "/rear/camera")), monkeypatch)
+    told = only_line(umf("replay", two, "--out", tmp_path / "runs"))
+    assert told.endswith("left_image: /front/camera/image_raw or /rear/camera/image_raw")
+    ended = umf("inspect", two)
+    assert ended.status == 3 and "topics.left_image names one" in ended.text
+    bare = [entry for entry in vlp_16_and_camera() if entry[0] != "/tf_static"]
+    told = only_line(umf("replay", write(tmp_path / "bare.mcap", bare, monkeypatch), "--out", tmp_path / "runs"))
+    assert "without /tf_static its sensors are anywhere; the parameter calibration names a file" in told
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_sensor_that_the_transforms_leave_out_and_raw_pictures_are_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entries = vlp_16_and_camera()
+    entries[-1][2].d[0] = 0.1
+    entries[0][2].transforms.pop()
+    bag = open_bag(write(tmp_path / "bag.mcap", entries, monkeypatch))
+    told: list[str] = []
+    assert not list(FrameReader(bag, settings_for(bag, None, "auto"), warn=told.append))
+    assert any("/tf_static does not say where velodyne is on base_link (parameters" in line for line in told)
+    assert any("the images are raw, with lens distortion" in line for line in told)

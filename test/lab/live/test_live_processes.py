@@ -88,7 +88,8 @@ def test_what_a_program_complains_of_is_shown_and_logged(tmp_path: Path) -> None
 def test_a_node_runs_in_a_session_of_its_own_until_it_is_stopped(tmp_path: Path) -> None:
     """The Ctrl-C of a terminal goes to every process of its session: the nodes must not see it."""
     lines: list[str] = []
-    process = NodeProcess("umf_ros.nodes.pose_graph_node", [], tmp_path, lines.append)
+    named = ["--ros-args", "-p", "dataset:=simulated"]
+    process = NodeProcess("umf_ros.nodes.pose_graph_node", named, tmp_path, lines.append)
     process.wait_ready()
     number = number_of("pose_graph_node")
     assert os.getsid(number) == number != os.getsid(0) and process.exit_code is None

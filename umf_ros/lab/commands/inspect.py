@@ -57,6 +57,7 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
     from rich.table import Table
 
     from umf_ros.runs.report import COLOURS
+    from umf_ros.sensors.topic_finder import describe_inputs
 
     console.print(f"{bag}: {recording.duration_s:.1f} s", **PLAIN)
     if recording.warning:
@@ -75,7 +76,7 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
     for one in found.advice:
         console.print(f"{one.severity}: {one.line}", style=COLOURS[one.severity], **PLAIN)
     if found.settings is not None:
-        console.print(f"data set: {found.settings.dataset}; umf replay {bag} needs no --config", **PLAIN)
+        console.print(f"{describe_inputs(found.settings)}; umf replay {bag} needs no --config", **PLAIN)
 
 
 def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> None:

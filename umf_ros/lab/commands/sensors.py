@@ -20,8 +20,9 @@ def command(
     workers: Annotated[int, typer.Option(min=1, max=3, help="Replays at a time.")] = 2,
     report: Annotated[bool, typer.Option("--report", help="Write a report for each replay, too.")] = False,
 ) -> None:
-    """Replay one recording with both sensors, with the LiDAR alone and with the camera alone, in one table.
+    """Check the sensors of a recording, and replay it with both, with the LiDAR alone and with the camera alone.
 
+    First come faults of light, clocks, mountings and baseline, and what the recording cannot tell of them.
     Without a recording, a drive is simulated that passes a stretch where the LiDAR sees nothing, even ground, and one
     where the camera sees nothing, after sunset. Takes some minutes.
     """
@@ -33,10 +34,13 @@ def command(
 
     from rich.console import Console
 
+    from umf_ros.bags.presets import settings_for
+    from umf_ros.bags.reader import open_bag
+    from umf_ros.bags.sensor_check import about_sensors
     from umf_ros.core.io import check_writable, create_run_folder, write_atomically
     from umf_ros.lab.commands import simulate
     from umf_ros.lab.evaluation.results import print_table
-    from umf_ros.lab.evaluation.sensors_run import replay_all, score, stretches_of, table_of
+    from umf_ros.lab.evaluation.sensors_run import check_sensors, replay_all, score, stretches_of, table_of
 
     console = Console()
     check_writable(out)
@@ -45,6 +49,10 @@ def command(
         if not bag.exists():
             simulate.command(bag, preset="sensors", seed=seed)
     stretches = stretches_of(bag)
+    recording = open_bag(bag)
+    told = [one.line for one in about_sensors(check_sensors(recording, settings_for(recording, config, "auto")))]
+    for line in told or ["nothing is wrong with light, clocks, mountings and baseline"]:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
     folder = create_run_folder(out)
     with console.status("replaying") as status:
         runs = replay_all(bag, config, folder, report, workers, lambda done: status.update(f"replayed {done} of 3"))

@@ -12,14 +12,15 @@ import numpy as np
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, decode
-from umf_ros.core.config import Settings, Topics
-from umf_ros.core.errors import MessageError, UmfError
+from umf_ros.core.config import Settings, Topics, topics_of
+from umf_ros.core.errors import MessageError, UmfError, either
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
 from umf_ros.core.trajectory import bracket
 from umf_ros.runs.findings import gap_remedy
 from umf_ros.sensors.calibration import TO_BE_MEASURED
-from umf_ros.sensors.decode import TYPES, decode_camera_info, decode_cloud, decode_image, decode_odometry
+from umf_ros.sensors.decode import decode_camera_info, decode_cloud, decode_image, decode_odometry
 from umf_ros.sensors.tf import TOPIC, StaticTransforms
+from umf_ros.sensors.topic_finder import find_topics
 
 SAMPLES = 20
 """Messages of a topic that are decoded."""
@@ -61,47 +62,21 @@ class Inspected:
 
 def inspect(bag: Bag) -> Inspected:
     """Look at a recording: topics to use, the first messages of each, how they pair, and what excludes everything."""
-    found = Inspected(guess_topics(bag))
+    topics, ambiguous = find_topics(bag.types)
+    found = Inspected(topics)
     try:
         found.settings = settings_for(bag, None, "auto")
+        named = {name: topic for name, topic in topics_of(found.settings).model_dump().items() if topic in bag.types}
+        found.topics = topics.model_copy(update=named)
     except UmfError as error:
         found.unknown = str(error)
+    for name in ambiguous if found.settings is None else ():
+        what = f"several topics fit {name}: {either(ambiguous[name])}"
+        found.advice.append(Advice("fault", what, f"topics.{name} names one"))
     _read_samples(bag, found)
     for rule in (_about_depth, _about_odometry, _about_pairs, _about_gaps):
         found.advice += rule(bag, found)
     return found
-
-
-def guess_topics(bag: Bag) -> Topics:
-    """The topics of each input by type and name: of several the one that says left or right, else the fullest."""
-    filled = [(topic, info) for topic, info in bag.topics.items() if info.count]
-    # plain images before compressed ones, otherwise the fullest topic first
-    by_name = {
-        name: [topic for kind in kinds for topic, info in filled if info.type == kind] for name, kinds in TYPES.items()
-    }
-    clouds, odometry = (sorted(by_name[name], key=lambda t: -bag.topics[t].count) for name in ("cloud", "odometry"))
-    words = ("depth", "mask", "semantic")
-    images = [topic for topic in by_name["left_image"] if not any(word in topic.lower() for word in words)]
-    right = next((topic for topic in images if "right" in topic.lower()), "")
-    left = next((topic for topic in images if "left" in topic.lower()), "")
-    left = left or next((topic for topic in images if topic != right), "")
-    infos = by_name["left_info"]
-    return Topics(
-        left_image=left,
-        right_image=right if left else "",
-        left_info=_nearest(left, infos),
-        right_info=_nearest(right, infos) if right else "",
-        cloud=clouds[0] if clouds else "",
-        odometry=odometry[0] if odometry else "",
-    )
-
-
-def _nearest(image: str, infos: list[str]) -> str:
-    """The camera_info beside an image: the one of the same namespace."""
-    space = image.split("/")
-    alike = {info: sum(a == b for a, b in zip(space, info.split("/")[:-1], strict=False)) for info in infos}
-    best = max(alike, key=lambda info: alike[info], default="")
-    return best if best and alike[best] > 1 else ""
 
 
 def _read_samples(bag: Bag, found: Inspected) -> None:

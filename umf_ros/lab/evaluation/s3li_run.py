@@ -28,7 +28,6 @@ from umf_ros.bags.sensor_check import SensorCheck
 from umf_ros.bags.trajectories import read_odometry, read_rtklib
 from umf_ros.core.config import Loop, Settings, load_preset
 from umf_ros.core.errors import UmfError, one_line
-from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array, heading
 from umf_ros.core.io import read_values, write_atomically
 from umf_ros.core.trajectory import Trajectory
@@ -190,13 +189,11 @@ def replay_sequence(one: S3liSequence, folder: Path) -> Record:
     if found and odometry is not None and (lag := clock_lag_s(odometry, found[1])):
         late = f"the odometry fits the satellites' positions {-lag:+.1f} s later than their stamps say"
         notes.append(f"{late}: is {found[0].name} in GPS time? its figures are not to be trusted")
-    scale = about.sensors.stereo_scale
-    if one.calibrations and math.isfinite(scale):
-        notes.append(f"with {one.calibrations[0].name}, stereo sees {scale:.2f} times as far as the LiDAR")
+    overlay = about.sensors.overlay
     notes += [one.line for one in look_first(replace(about, missed=[])) if one.severity != "note"]
     record = judged_record(about, odometry)
     minutes = round((time.monotonic() - started) / 60, 2)
-    return record | {"warnings": notes, "minutes": minutes, "stereo_scale": _number(scale)}
+    return record | {"warnings": notes, "minutes": minutes, "stereo_scale": overlay and _number(overlay.scale)}
 
 
 def _open(one: S3liSequence, folder: Path, notes: list[str]) -> tuple[Any, Settings, Trajectory | None]:
@@ -236,21 +233,12 @@ def _replayed(
 ) -> tuple[FinishedRun, SensorCheck]:
     replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
     reader = FrameReader(recording, settings, odometry, warn=notes.append)
-    check = SensorCheck()
-
-    def watched() -> Iterator[Any]:
-        for item in reader.stream():
-            if isinstance(item, Frame):
-                check.take(item)
-                _progress(reader.progress)
-            yield item
-
-    for _ in replay.run(watched()):
-        pass
+    for _ in replay.run(reader.stream()):
+        _progress(reader.progress)
     replay.finish(count_drops(reader.counters))
     replay.raise_if_frames_failed()
     remember_recording(folder, recording)
-    return read_run(folder), check
+    return read_run(folder), replay.sensor_check
 
 
 def judged_record(about: JudgedRun, odometry: Trajectory | None) -> Record:

@@ -15,7 +15,9 @@ from rich.console import Console
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
-from umf_ros.bags.reader import open_bag
+from umf_ros.bags.reader import Bag, open_bag
+from umf_ros.bags.sensor_check import SensorReport, check_stream
+from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.tasks import spread
 from umf_ros.detector import LoopDetector, make_detector_embedder
@@ -82,6 +84,11 @@ def stretches_of(bag: Path) -> list[Stretch]:
     legs = json.loads(notes[0]["legs"]) if notes else []
     named = [Stretch(leg["label"], leg["from_ns"], leg["to_ns"]) for leg in legs if leg["label"] != "first"]
     return [*named, whole] if len(named) > 1 else [whole]
+
+
+def check_sensors(bag: Bag, settings: Settings) -> SensorReport:
+    """Return the check of a recording's measurements against each other."""
+    return check_stream(FrameReader(bag, settings, warn=lambda _: None).stream())
 
 
 def replay_all(

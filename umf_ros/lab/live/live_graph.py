@@ -21,11 +21,12 @@ from umf_ros.durable_graph import JOURNAL, DurableGraph
 
 START_TIMEOUT_S = 180.0
 STOP_TIMEOUT_S = 60.0
-READY = "ready"
+READY, WAITING = "ready", "waiting for topics"
+"""First line of a node; one that waits has to hear the player before it is ready."""
 PLAYER = "umf_ros.lab.live.bag_player_node"
 NODES = ("umf_ros.nodes.loop_closure_node", "umf_ros.nodes.pose_graph_node")
 # a recording of the simulator must arrive whole, however busy the machine is; its sensors are where its file says
-WHOLE = ("qos.reliability:=reliable", "qos.depth:=200", "frames.extrinsics:=calibration")
+WHOLE = ("dataset:=simulated", "qos.reliability:=reliable", "qos.depth:=200", "frames.extrinsics:=calibration")
 
 
 class NodeProcess:
@@ -57,7 +58,7 @@ class NodeProcess:
         return self._process.poll()
 
     def wait_ready(self) -> None:
-        """Wait until the node says it is ready.
+        """Wait until the node says it is ready, or waits for topics.
 
         Raises:
             UmfError: it ended, or took too long.
@@ -90,7 +91,7 @@ class NodeProcess:
         for line in self._process.stdout:
             self._log.write(line)
             self._log.flush()
-            if line.strip() == READY:
+            if line.strip() == READY or line.startswith(WAITING):
                 self.ready.set()
             else:
                 self._on_line(line.rstrip())

@@ -6,10 +6,10 @@ const narrow = () => innerWidth < 600;
 const KINDS = {
   accepted: { name: "accepted", colour: "#2da44e", symbol: "circle", shown: true },
   pending: { name: "pending", colour: "#d4a000", symbol: "diamond", shown: true },
-  rejected: { name: "rejected by the graph", colour: "#e5534b", symbol: "x", shown: true },
+  rejected: { name: "rejected by the pose graph", colour: "#e5534b", symbol: "x", shown: true },
   false: { name: "false", colour: "#d6336c", symbol: "star", shown: true },
   missed: { name: "missed revisit", colour: "#8250df", symbol: "circle-open", shown: true },
-  tested: { name: "nearly, not published", colour: "#6e7781", symbol: "triangle-up-open", shown: "legendonly" },
+  tested: { name: "rejected by the verification", colour: "#6e7781", symbol: "triangle-up-open", shown: "legendonly" },
 };
 const BUTTONS = [["zoom2d", "pan2d", "resetScale2d", "toImage"]];
 const CURVES = { "ground truth": ["#24292f", "#c9d1d9"], odometry: ["#e07b00", "#f0a04b"], optimised: ["#1f6fb4", "#58a6ff"] };
@@ -35,7 +35,7 @@ function hide(id, when) { byId(id).classList.toggle("hidden", when); }
 function seconds(index) { return scene.keyframes.t[index]; }
 function title(pair) {
   const what = pair.number ? `closure ${pair.number}, ${KINDS[pair.kind].name}` : KINDS[pair.kind].name;
-  return `${what}: ${seconds(pair.q).toFixed(1)} s, seen ${(seconds(pair.q) - seconds(pair.m)).toFixed(1)} s before`;
+  return `${what}: ${seconds(pair.q).toFixed(1)} s, match ${(seconds(pair.q) - seconds(pair.m)).toFixed(1)} s earlier`;
 }
 
 function drawTrajectory() {
@@ -56,7 +56,7 @@ function drawTrajectory() {
       line: { color: style.colour, width: kind === "accepted" ? 1 : 1.6, dash: kind === "missed" || kind === "tested" ? "dot" : "solid" } });
     traces.push({ mode: "markers", name: `${style.name} (${mine.length})`, legendgroup: kind, visible: style.shown,
       x: mine.map(([pair]) => xy[pair.q][0]), y: mine.map(([pair]) => xy[pair.q][1]), customdata: mine.map(([, i]) => i),
-      text: mine.map(([pair]) => title(pair) + (pair.p === null ? "" : `<br>probability ${pair.p}`) + (pair.graph ? `<br>graph ${pair.graph}` : "")),
+      text: mine.map(([pair]) => title(pair) + (pair.p === null ? "" : `<br>probability ${pair.p}`) + (pair.graph ? `<br>pose graph: ${pair.graph}` : "")),
       hoverinfo: "text", marker: { color: style.colour, symbol: style.symbol, size: narrow() ? 10 : 8, line: { color: style.colour, width: 1.5 } } });
   }
   const pair = scene.pairs[selected];
@@ -87,14 +87,14 @@ function drawPair() {
   byId("pair-title").style.color = KINDS[pair.kind].colour;
   const table = byId("pair-facts");
   table.replaceChildren();
-  row(table, "why", pair.why);
+  row(table, "reason", pair.why);
   row(table, "would let it through", pair.parameter);
   row(table, "probability", pair.p);
   row(table, "similarity", pair.s);
-  row(table, "graph", pair.graph);
-  row(table, "truth", pair.truth, pair.truth.startsWith("FALSE") ? "bad" : pair.truth.startsWith("true") ? "good" : "");
-  if (pair.pose) row(table, "apart", `${pair.shift_m} m, ${pair.turn_deg} deg, by ${pair.pose_source}`);
-  row(table, "look closer", `umf explain BAG ${pair.stamps[0]} ${pair.stamps[1]}`);
+  row(table, "pose graph", pair.graph);
+  row(table, "ground truth", pair.truth, pair.truth.startsWith("FALSE") ? "bad" : pair.truth.startsWith("true") ? "good" : "");
+  if (pair.pose) row(table, "relative pose", `${pair.shift_m} m, ${pair.turn_deg} deg, by ${pair.pose_source}`);
+  row(table, "details", `umf explain BAG ${pair.stamps[0]} ${pair.stamps[1]}`);
   drawViews(pair);
   drawScans(pair);
   drawBars(pair);
@@ -124,7 +124,7 @@ async function drawViews(pair) {
     pen.globalAlpha = 1;
     for (const end of ends) { pen.beginPath(); pen.arc(...end, 2, 0, 7); pen.fill(); }
   });
-  const order = stacked ? "above now, below then" : "left now, right then";
+  const order = stacked ? "above: query, below: match" : "left: query, right: match";
   byId("views-caption").textContent = `${order}; ${pair.inlier_count ?? "no"} image features agree with the pose`;
 }
 function pointsOf(stamp) {
@@ -145,18 +145,18 @@ function drawScans(pair) {
     const sorted = [...match, ...moved].map((p) => p[axis]).sort((a, b) => a - b), at = (share) => sorted[Math.round(share * (sorted.length - 1))];
     return [at(0.01) - 1, at(0.99) + 1];
   };
-  const view = (id, axis, label, shown) => draw(id, [trace(match, axis, "then", curveColour("optimised"), shown), trace(moved, axis, "now", curveColour("odometry"), shown)],
-    { xaxis: { title: axis === 2 ? "ahead [m]" : "", range: range(0) }, yaxis: { title: label, range: range(axis), ...(axis === 1 ? { scaleanchor: "x" } : {}) }, margin: { l: 44, r: 8, t: 4, b: axis === 2 ? 36 : 20 } });
+  const view = (id, axis, label, shown) => draw(id, [trace(match, axis, "match", curveColour("optimised"), shown), trace(moved, axis, "query", curveColour("odometry"), shown)],
+    { xaxis: { title: axis === 2 ? "forward [m]" : "", range: range(0) }, yaxis: { title: label, range: range(axis), ...(axis === 1 ? { scaleanchor: "x" } : {}) }, margin: { l: 44, r: 8, t: 4, b: axis === 2 ? 36 : 20 } });
   view("scans-above", 1, "left [m]", true);
   view("scans-side", 2, "up [m]", false);
-  byId("scans-caption").textContent = pose ? `scans from above and from the side, laid together by ${pair.pose_source}` : "scans from above and from the side, not laid together: no pose is known";
+  byId("scans-caption").textContent = pose ? `scans from above and from the side, aligned by ${pair.pose_source}` : "scans from above and from the side, not aligned: no pose available";
 }
 function drawBars(pair) {
   hide("pair-bars", !pair.bars || !pair.bars.length);
   if (!pair.bars || !pair.bars.length) return;
   const bars = pair.bars.slice(0, 14).reverse(), names = bars.map((bar) => bar[0].replaceAll("_", " "));
   const sum = pair.bars.reduce((total, bar) => total + bar[1], 0);
-  byId("bars-caption").textContent = `Log-odds: ${sum.toFixed(1)} speak for it, ${(-pair.bias).toFixed(1)} have to be overcome; grey could have been added.`;
+  byId("bars-caption").textContent = `Log-odds: sum of the measurements ${sum.toFixed(1)}, bias ${pair.bias.toFixed(1)}; grey: missing to a measurement's maximum.`;
   byId("bars").style.height = 40 + 22 * bars.length + "px";
   draw("bars", [
     { type: "bar", orientation: "h", y: names, x: bars.map((bar) => bar[1]), name: "given", marker: { color: bars.map((bar) => (bar[1] < 0 ? "#e5534b" : "#2da44e")) }, hovertemplate: "%{y}: %{x}<extra></extra>" },
@@ -181,8 +181,8 @@ function drawSweep() {
   const percent = (share) => (share === null ? "unknown" : (100 * share).toFixed(1) + " %");
   const asRun = Math.abs(now - scene.threshold) < 0.003 ? " (as in this run)" : "";
   byId("threshold-words").textContent = here.judged || here.revisits
-    ? `from ${now.toFixed(3)} on${asRun}: ${here.found} closures, precision ${percent(here.precision)}, recall ${percent(here.recall)} (${here.closed} of ${here.revisits} revisits)`
-    : `from ${now.toFixed(3)} on${asRun}: ${here.found} closures; there is no truth to judge them by`;
+    ? `threshold ${now.toFixed(3)}${asRun}: ${here.found} closures, precision ${percent(here.precision)}, recall ${percent(here.recall)} (${here.closed} of ${here.revisits} revisits)`
+    : `threshold ${now.toFixed(3)}${asRun}: ${here.found} closures, no ground truth`;
   const traces = all.some((one) => one.judged) ? [
     { mode: "lines", name: "precision", x: steps, y: all.map((one) => one.precision), line: { color: "#2da44e", width: 5 } },
     { mode: "lines", name: "recall", x: steps, y: all.map((one) => one.recall), line: { color: curveColour("optimised"), width: 2 } },

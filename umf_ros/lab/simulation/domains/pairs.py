@@ -168,14 +168,14 @@ def _submaps(drive: list[Keyframe], wanted: range) -> dict[int, tuple[Keyframe |
     anchors, drift = [drive[0]], DriftMeter()
     for keyframe in drive:
         if keyframe.path_length_m - anchors[-1].path_length_m >= const.MERGE_STEP_M:
-            before = _between(anchors, keyframe, -const.SUBMAP_BEFORE_M, 0.0)
+            before = _between(anchors, keyframe, -const.ODOMETRY_REACH_M, 0.0)
             if needed_scans(keyframe, before):
                 drift.add(keyframe, before)
             anchors.append(keyframe)
     found = {}
     for number in wanted:
-        reaches = (0.0, const.SUBMAP_AFTER_M)
-        others = [_between(anchors, drive[number], -const.SUBMAP_BEFORE_M, last_m) for last_m in reaches]
+        reaches = (0.0, const.ODOMETRY_REACH_M)
+        others = [_between(anchors, drive[number], -const.ODOMETRY_REACH_M, last_m) for last_m in reaches]
         submaps = [submap_of(drive[number], one, drift) for one in others]
         found[number] = submaps[0], submaps[1]
     return found

@@ -1,10 +1,8 @@
-"""Write verdicts, vertices and edges of the pose graph."""
+"""Graphs of poses as g2o files."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +10,10 @@ from numpy.typing import ArrayLike
 
 from umf_ros.core.errors import writing
 from umf_ros.core.geometry import Array, to_quaternion
-from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureVerdict
-from umf_ros.pose_graph.solver import EDGE
 
+EDGE = np.dtype([("first", "i8"), ("second", "i8"), ("pose", "f8", (4, 4)), ("covariance", "f8", (6, 6))])
+"""Fields of an array of edges; see `Edge`."""
 _ROTATION_LAST = np.array([3, 4, 5, 0, 1, 2])
-
-
-def verdict_table(verdicts: Iterable[ClosureVerdict]) -> str:
-    """Return all verdicts as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(VERDICT_COLUMNS)
-    for verdict in verdicts:
-        numbers = (f"{verdict.residual:.3f}", f"{verdict.residual_m:.3f}")
-        endpoints = verdict.closure.match_stamp_ns, verdict.closure.query_stamp_ns
-        writer.writerow([*endpoints, verdict.state.value, verdict.reason, *numbers])
-    return text.getvalue()
 
 
 def write_g2o(path: Path, poses: Array, edges: ArrayLike, ids: Sequence[int] | None = None) -> None:
