@@ -30,8 +30,8 @@ _HELP = {
     "pose": "the odometry must send unit quaternions",
     "transforms": "calibration names a file that says how the sensors are mounted",
     "camera_info": "calibration names a file with the intrinsics",
-    "late": "sync.max_wait_s waits longer",
-    "queue full": "sync.queue_size keeps more",
+    "late": "a larger sync.max_wait_s waits longer",
+    "queue full": "a larger sync.queue_size keeps more",
 }
 """Remedy by the reason for which messages are dropped."""
 MUCH_LOST = 0.2
