@@ -108,7 +108,7 @@ def rng() -> np.random.Generator:
 def ros_context() -> Iterator[None]:
     import rclpy
 
-    rclpy.init()
+    rclpy.init(args=["--ros-args", "-p", "dataset:=s3li-etna"])  # its topics, instead of a search by type
     yield
     rclpy.try_shutdown()
 

@@ -16,7 +16,7 @@ from umf_ros.nodes.loop_closure_node import LoopClosureNode
 
 @pytest.fixture
 def node() -> Iterator[LoopClosureNode]:
-    rclpy.init(args=["--ros-args", "-p", "embedding.method:=solid"])
+    rclpy.init(args=["--ros-args", "-p", "embedding.method:=solid", "-p", "dataset:=s3li-etna"])
     node = LoopClosureNode()
     yield node
     node.close()

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from umf_ros.core.config import Verification
-from umf_ros.core.frames import Candidate, Keyframe
+from umf_ros.core.frames import Candidate, Keyframe, Points
 from umf_ros.core.geometry import Array, near, relative
 from umf_ros.verification import constants as const
 from umf_ros.verification.hypothesis import Hypothesis
@@ -53,6 +53,13 @@ def find_hypotheses(
         if not any(near(fit.pose, other.pose, const.DISTINCT_M, const.DISTINCT_RAD) for other in distinct):
             distinct.append(fit)
     return [Hypothesis.of(query, candidate, keyframe, pose=fit.pose, score=fit.score) for fit in distinct]
+
+
+def consistent_pixels(hypothesis: Hypothesis, settings: Verification) -> Points:
+    """Return the pixels (K, 4) of the image features of query and match that agree with the pose of a hypothesis."""
+    query, match = hypothesis.keyframes
+    views = hypothesis.views or paired_views(query, match, settings)
+    return np.empty((0, 4), np.float32) if views is None else views.consistent_pixels(hypothesis.pose)
 
 
 def paired_views(query: Keyframe, match: Keyframe, settings: Verification) -> PairedViews | None:

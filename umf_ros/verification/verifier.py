@@ -17,7 +17,7 @@ from umf_ros.verification.acceptance import load_acceptance, refuted
 from umf_ros.verification.ambiguity import ambiguity, passage_rival
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
-from umf_ros.verification.pose_search import TemporalMemory, find_hypotheses, paired_views, prior_sigmas
+from umf_ros.verification.pose_search import TemporalMemory, consistent_pixels, find_hypotheses, prior_sigmas
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans
@@ -213,13 +213,10 @@ class Verifier:
 
     def _decide(self, hypothesis: Hypothesis) -> None:
         """Set the closure, or the reason why there is none."""
-        query, match = hypothesis.keyframes
-        views = hypothesis.views or paired_views(query, match, self._settings)
-        if views is not None:
-            hypothesis.inlier_pixels = views.consistent_pixels(hypothesis.pose)
         if (objection := self._objection(hypothesis)) is not None:
             hypothesis.reject(*objection)
             return
+        hypothesis.inlier_pixels = consistent_pixels(hypothesis, self._settings)
         covariance = closure_covariance(hypothesis, self._acceptance.covariances[hypothesis.kind])
         probability = hypothesis.probability or 0.0
         hypothesis.closure = LoopClosure(*hypothesis.endpoints, hypothesis.pose, covariance, probability)

@@ -27,6 +27,7 @@ from umf_ros.runs.run_file import pose_numbers
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.verification import Hypothesis, Verifier
 from umf_ros.verification.acceptance import load_acceptance
+from umf_ros.verification.pose_search import consistent_pixels
 
 NO_CALIBRATION = "no calibration: images alone give no pose without one"
 NO_DEPTH = "no depth: images without a scan or a right image give no metric pose"
@@ -375,7 +376,7 @@ def explain(query: Keyframe, match: Keyframe, settings: Verification) -> Explana
         return Explanation(query, match, None, settings.min_probability, {}, np.empty((0, 4), np.float32))
     best = max(examined, key=lambda one: one.probability or 0.0)
     contributions = load_acceptance(settings.calibration).contributions(best.measurements)
-    pixels = best.views.consistent_pixels(best.pose) if best.views else np.empty((0, 4), np.float32)
+    pixels = consistent_pixels(best, settings)
     return Explanation(query, match, best, settings.min_probability, contributions, pixels)
 
 
