@@ -349,7 +349,7 @@ LAG_S = 0.1
 MOUNTING_DEG = 6.0
 """Measured on simulated drives: right mountings come out within 3.3 deg, the worst about the vertical."""
 FINE_DEG, FINE_SCALE, FINE_S = 0.5, 0.006, 0.01
-"""Measured on simulated drives: what is right comes out within half of it, where stereo is laid over the scans."""
+"""Measured on simulated drives: with a right calibration, the errors by stereo over the scans are below half of these."""
 SURE = 3.0
 """Standard deviations, by hand."""
 SAME_DEG = 5.0
