@@ -9,6 +9,7 @@ from umf_ros.core.geometry import (
     Array,
     adjoint,
     align,
+    evenly,
     expmap,
     gtsam_to_ros_covariance,
     heading,
@@ -136,3 +137,11 @@ def test_alignment_never_mirrors(rng: np.random.Generator) -> None:
 def test_too_few_positions_are_refused() -> None:
     with pytest.raises(ValueError, match="cannot align 2 positions with 2"):
         align(np.zeros((2, 3)), np.zeros((2, 3)))
+
+
+@pytest.mark.parametrize(("count", "most"), [(0, 5), (1, 5), (5, 5), (9, 4), (1000, 7)])
+def test_indices_are_spread_from_the_first_to_the_last_without_repetition(count: int, most: int) -> None:
+    chosen = evenly(count, most).tolist()
+    assert len(chosen) == min(count, most) == len(set(chosen)) and chosen == sorted(chosen)
+    assert not chosen or (chosen[0], chosen[-1]) == (0, count - 1)
+    assert not chosen or max(np.diff(chosen), default=1) - min(np.diff(chosen), default=1) <= 1

@@ -171,3 +171,8 @@ def gtsam_to_ros_covariance(covariance: ArrayLike, pose: Array) -> Array:
 def _swap_blocks(matrix: Array) -> Array:
     order = [3, 4, 5, 0, 1, 2]
     return matrix[np.ix_(order, order)]
+
+
+def evenly(count: int, most: int) -> NDArray[np.intp]:
+    """Return all of `count` indices, or `most` of them evenly spread from the first to the last."""
+    return np.linspace(0, count - 1, min(count, most)).astype(np.intp)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from umf_ros.core.frames import Points
-from umf_ros.core.geometry import invert, transform
+from umf_ros.core.geometry import evenly, invert, transform
 from umf_ros.core.io import atomic_write
 from umf_ros.maps.joint_graph import JointMap
 from umf_ros.maps.map_folder import MapFolder
@@ -53,7 +53,7 @@ class MapCloud:
         [after the mean plane variance of Razlaw 2015]; NaN where no two recordings overlap.
         """
         tree = cKDTree(self.points)
-        rows = np.unique(np.linspace(0, len(self.points) - 1, min(len(self.points), _MOST_PROBED)).astype(int))
+        rows = evenly(len(self.points), _MOST_PROBED)
         found = []
         for near in tree.query_ball_point(self.points[rows], _NEIGHBOURS_M) if len(rows) else []:
             if len(near) >= _FEWEST and len(set(self.sessions[near].tolist())) > 1:

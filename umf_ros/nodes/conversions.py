@@ -18,7 +18,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from umf_ros.core.config import FrameIds, Qos
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import LoopClosure
-from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
+from umf_ros.core.geometry import Array, evenly, from_quaternion, to_quaternion
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose
 
 
@@ -196,7 +196,7 @@ def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: FrameIds) -> P
     """Return the trajectory as a path, evenly thinned to at most `MAX_POSES` poses."""
     if not len(stamps_ns):
         return Path(header=Header(frame_id=frames.map))
-    rows = np.unique(np.linspace(0, len(stamps_ns) - 1, MAX_POSES).astype(int))
+    rows = evenly(len(stamps_ns), MAX_POSES)
     both = zip(stamps_ns[rows].tolist(), to_poses(map_T_body[rows]), strict=True)
     poses = [PoseStamped(header=to_header(stamp, frames.map), pose=pose) for stamp, pose in both]
     return Path(header=to_header(int(stamps_ns[-1]), frames.map), poses=poses)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from umf_ros.core.frames import Image
-from umf_ros.core.geometry import Array, transform
+from umf_ros.core.geometry import Array, evenly, transform
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.run_file import NAME, SCAN_UNIT_M, Picture, RunFile
 
@@ -88,7 +88,7 @@ class Gallery:
     def scan(self, stamp_ns: int) -> str:
         """Return some points of a keyframe's scan: base64, little-endian int16 triples in `SCAN_UNIT_M`, body frame."""
         scan = self.pictures[stamp_ns].scan
-        chosen = scan[np.linspace(0, len(scan) - 1, min(len(scan), SHOWN_POINTS)).astype(int)]
+        chosen = scan[evenly(len(scan), SHOWN_POINTS)]
         return base64.b64encode(chosen.astype("<i2").tobytes()).decode("ascii")
 
     def map_picture(self) -> dict[str, Any] | None:

@@ -29,7 +29,7 @@ from umf_ros.bags.sensor_check import SensorCheck, SensorReport, check_stream
 from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Image, LoopClosure
-from umf_ros.core.geometry import Array
+from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
@@ -115,7 +115,7 @@ def draw_match(query: Image, match: Image, inliers: Array, caption: str) -> Imag
     canvas[margin:, :width] = query[..., None]
     canvas[margin:, width + gap :] = cv2.resize(match, (width, height))[..., None]
     cv2.putText(canvas, caption, (8, 23), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (30, 30, 30), 1, cv2.LINE_AA)
-    chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), MAX_LINES)).astype(int)] if len(inliers) else []
+    chosen = inliers[evenly(len(inliers), MAX_LINES)]
     hues = np.linspace(0, 179, max(len(chosen), 1)).astype(np.uint8)
     colours = cv2.cvtColor(np.stack([hues, hues * 0 + 220, hues * 0 + 255], -1)[None], cv2.COLOR_HSV2BGR)[0]
     for (u0, v0, u1, v1), colour in zip(chosen, colours.tolist(), strict=False):
@@ -285,7 +285,7 @@ def finish_run(
         inliers = read_inliers(folder / "inliers.csv")
         pairs = pairs_of(about)
         shown = [stamp for key in by_need(pairs)[:MAX_SHOWN] for stamp in key]
-        rows = np.linspace(0, len(run.closures) - 1, min(len(run.closures), MAX_PICTURES)).astype(int)
+        rows = evenly(len(run.closures), MAX_PICTURES)
         chosen = [run.closures[row] for row in rows]
         drawn = {*shown, *(stamp for one in chosen for stamp in one.endpoints)}
         gallery = read_gallery(folder, drawn, drawn_trajectory(about))

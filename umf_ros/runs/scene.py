@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from umf_ros.core.frames import Points
-from umf_ros.core.geometry import Array, relative, rotation_angle
+from umf_ros.core.geometry import Array, evenly, relative, rotation_angle
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, contributions, explain, missing, most_probable
@@ -176,7 +176,7 @@ def build_scene(about: JudgedRun, pairs: Pairs, gallery: Gallery, inliers: Mappi
         pairs[key] |= _details(about, key, pairs[key]["number"])
     for key, lines in inliers.items():
         if key in pairs and str(key[0]) in photographs:
-            few = lines[np.linspace(0, len(lines) - 1, min(len(lines), MAX_INLIERS)).astype(int)]
+            few = lines[evenly(len(lines), MAX_INLIERS)]
             pairs[key] |= {"inliers": np.rint(few).astype(int).tolist(), "inlier_count": len(lines)}
     return {
         "curves": [{"name": name, "xyz": _thin(xyz).T.tolist()} for name, xyz in named_curves(about.run).items()],
@@ -248,7 +248,7 @@ def _positions(about: JudgedRun) -> Array:
 def _similarity(descriptors: Points | None) -> dict[str, Any] | None:
     if descriptors is None or not len(descriptors):
         return None
-    rows = np.unique(np.linspace(0, len(descriptors) - 1, MAX_SIDE).astype(int))
+    rows = evenly(len(descriptors), MAX_SIDE)
     matrix = np.clip(np.rint(100 * descriptors[rows] @ descriptors[rows].T), -100, 100).astype("<i1")
     return {"rows": rows.tolist(), "data": base64.b64encode(matrix.tobytes()).decode("ascii")}
 
@@ -288,5 +288,5 @@ def error_curves(run: FinishedRun) -> dict[str, list[list[float]]]:
 
 def _thin(rows: Array) -> Array:
     """Return some of the rows (N, C), rounded to a millimetre."""
-    kept = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_POINTS)).astype(int))]
+    kept = rows[evenly(len(rows), MAX_POINTS)]
     return np.asarray(np.round(kept, 3))

@@ -23,7 +23,7 @@ from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, Keyframe
-from umf_ros.core.geometry import Array
+from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import create_run_folder, write_atomically
 from umf_ros.runs.run_file import (
     NAME,
@@ -240,9 +240,7 @@ class RunRecorder:
 
 def picture_of(frame: Frame, keyframe: Keyframe) -> Picture:
     """Reduce the left image and the scan of a keyframe to the size in the report."""
-    points = keyframe.points[
-        np.linspace(0, len(keyframe.points) - 1, min(len(keyframe.points), SCAN_POINTS)).astype(int)
-    ]
+    points = keyframe.points[evenly(len(keyframe.points), SCAN_POINTS)]
     scan = np.clip(np.rint(points / SCAN_UNIT_M), -32767, 32767).astype(np.int16)
     if frame.left is None:
         return Picture(frame.stamp_ns, b"", 0, 0, scan)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from umf_ros.core.geometry import Array, invert, near
+from umf_ros.core.geometry import Array, evenly, invert, near
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan, common_blur
 from umf_ros.verification.scan_alignment import SEARCHED
@@ -138,7 +138,7 @@ def _misfit_with(scan: PreparedScan, other: PreparedScan, poses: Array, every: i
     """
     total, count = np.zeros(len(poses)), np.zeros(len(poses), int)
     for planes, others in zip(scan.surfaces, reversed(other.surfaces), strict=True):
-        picks = np.linspace(0, len(others.points) - 1, min(const.PASSAGE_SAMPLE, len(others.points))).astype(np.intp)
+        picks = evenly(len(others.points), const.PASSAGE_SAMPLE)
         points = (others.points[picks[::every]] @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(
             -1, 3
         )

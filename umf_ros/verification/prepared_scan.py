@@ -12,7 +12,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Frame, Keyframe, Points, ScanMotion
-from umf_ros.core.geometry import Array, invert, make_pose, transform
+from umf_ros.core.geometry import Array, evenly, invert, make_pose, transform
 from umf_ros.core.levelling import upright
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import GridMap
@@ -225,7 +225,7 @@ class PreparedScan:
     @cached_property
     def picks(self) -> Indices:
         """(S,) indices of at most 1500 points, evenly taken."""
-        return np.linspace(0, len(self.points) - 1, min(const.SAMPLE, len(self.points))).astype(np.intp)
+        return evenly(len(self.points), const.SAMPLE)
 
     @cached_property
     def sample(self) -> Array:
