@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import time
@@ -159,7 +158,7 @@ class LoopDetector:
         self._verifier = Verifier(settings.verification)
         self.database = _open_places(settings, embedder)
         self.inter_robot = _connect_fleet(settings, self.database, embedder)
-        self._map = _sessions_of(Path(settings.map), self.database) if settings.localizing else None
+        self._map = self.database.listed
         self.seen: PlaceDatabase | None = None
         if settings.grows_map:
             self.seen = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
@@ -381,15 +380,6 @@ def _assemble(frame: Frame, embedding: Embedding, path_length_m: float, session:
         body_T_lidar=frame.body_T_lidar,
         motion=motion,
     )
-
-
-def _sessions_of(map_folder: Path, places: PlaceDatabase) -> range:
-    """Sessions that a map lists: places of later ones are of an addition that was cut off."""
-    path = map_folder / "map.json"
-    if not path.is_file():
-        return range(places.next_session)
-    sessions = json.loads(path.read_text(encoding="utf-8"))["sessions"]
-    return range(max((one["first_number"] + one["numbers"] for one in sessions), default=0))
 
 
 def _connect_fleet(settings: Settings, database: PlaceDatabase, embedder: Embedder) -> InterRobotMatcher | None:

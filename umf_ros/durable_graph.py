@@ -27,13 +27,12 @@ _TABLES = (
     "CREATE TABLE verdict (match_ns INTEGER, query_ns INTEGER, state TEXT, reason TEXT, residual REAL, "
     "residual_m REAL, PRIMARY KEY (match_ns, query_ns))",
 )
-_SCHEMA = Schema("pose graph", (_TABLES,), lambda tables: int({"event", "verdict"} <= tables))
+_SCHEMA = Schema("pose graph", (_TABLES,))
 ODOMETRY, CLOSURE, STARTED, UNSETTLED = "odometry", "closure", "started", "unsettled"
 BY_HAND = {"revoked": State.REJECTED, "accepted": State.ACCEPTED, "undone": State.PENDING}
 """Decisions by hand, as they are logged."""
 _ABSOLUTE = (Aid.GNSS.value, Aid.GRAVITY.value)
-# "decided" is of earlier versions
-_NUMBERS = {ODOMETRY: 16, CLOSURE: 53, STARTED: 0, UNSETTLED: 0, "decided": 0, **dict.fromkeys(BY_HAND, 0)}
+_NUMBERS = {ODOMETRY: 16, CLOSURE: 53, STARTED: 0, UNSETTLED: 0, **dict.fromkeys(BY_HAND, 0)}
 _NUMBERS |= dict.fromkeys(_ABSOLUTE, 15)
 _EVENT = "INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)"
 _EVENTS = "SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"

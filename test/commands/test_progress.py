@@ -112,7 +112,7 @@ def test_places_and_closures_are_counted_beside_the_bar() -> None:
 
 def test_what_the_graph_has_not_decided_is_pending() -> None:
     out = io.StringIO()
-    counts = {"accepted": 2, "undecided": 1, "waiting": 3, "rejected": 1}
+    counts = {"accepted": 2, "pending": 4, "rejected": 1}
     with FrameProgress(Console(file=out, force_terminal=True, width=140), lambda: counts) as progress:
         progress.show(0.5, found(3, 7))
     assert "1 places, 7 closures (2 in the graph, 4 pending, 1 rejected)" in out.getvalue()

@@ -12,7 +12,7 @@ import pytest
 from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.core.io import Schema, SqliteFile, atomic_write
 
-FIRST = Schema("log", (("CREATE TABLE line (text TEXT)",),), unversioned=lambda tables: int("line" in tables))
+FIRST = Schema("log", (("CREATE TABLE line (text TEXT)",),))
 SECOND = Schema("log", (*FIRST.migrations, ("ALTER TABLE line ADD COLUMN level INTEGER DEFAULT 7",)))
 BESIDE = Schema("queue", (("CREATE TABLE queued (id INTEGER)",),))
 
@@ -61,14 +61,6 @@ def test_a_file_of_an_earlier_version_is_migrated_once(tmp_path: Path) -> None:
         file.close()
 
 
-def test_a_file_from_before_versions_is_taken_up(tmp_path: Path) -> None:
-    with closing(sqlite3.connect(tmp_path / "a.sqlite")) as connection, connection:
-        connection.execute("CREATE TABLE line (text TEXT)")
-    file = SqliteFile(tmp_path / "a.sqlite", Schema("log", SECOND.migrations, FIRST.unversioned))
-    assert lines(file) == []
-    file.close()
-
-
 def test_a_file_holds_several_schemas(tmp_path: Path) -> None:
     path = made(tmp_path / "a.sqlite")
     file = SqliteFile(path, SECOND)
@@ -92,7 +84,7 @@ def test_later_versions_other_files_and_two_writers_are_refused_in_one_line(tmp_
     path = made(tmp_path / "a.sqlite", SECOND)
     with pytest.raises(UmfError, match=r"has version 2 of a log, this umf_ros reads 1"):
         SqliteFile(path, FIRST)
-    with pytest.raises(UmfError, match=r"is no queue: it holds line, schema_version"):
+    with pytest.raises(UmfError, match=r"is no queue, or one of an earlier version: it holds line, schema_version"):
         SqliteFile(path, BESIDE)
     writer = SqliteFile(path, SECOND)
     reader = SqliteFile(path, SECOND, read_only=True)

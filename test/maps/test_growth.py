@@ -19,7 +19,6 @@ from maps_made import COVARIANCE, MadeSession, made_map, on_circle, relative
 from umf_ros.core.config import Database, Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure
-from umf_ros.detector import _sessions_of
 from umf_ros.localizer import read_poses
 from umf_ros.maps.growth import grow
 from umf_ros.maps.joint_graph import solve
@@ -27,7 +26,7 @@ from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import open_places
 from umf_ros.maps.outputs import write_results
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.places.store import stored_sessions
+from umf_ros.places.store import stored_identity, stored_sessions
 from umf_ros.runs.run_file import RunFile, closure_row
 from umf_ros.runs.writer import PLACES
 
@@ -134,9 +133,8 @@ def test_a_kill_at_any_moment_leaves_the_old_map_or_the_new_one(map_folder: MapF
         folder, poses = MapFolder.open(spare), read_poses(spare)
         seen.add((len(folder.sessions), len(poses.stamps_ns) == len(after.stamps_ns)))
         assert len(folder.sessions) in (1, 2) and len(poses.stamps_ns) in (len(before.stamps_ns), len(after.stamps_ns))
-        with closing(open_places(spare / "places.sqlite")) as places:
-            listed = _sessions_of(spare, places)
-            assert listed == range(len(folder.sessions)) and places.next_session >= len(listed)
+        with closing(PlaceDatabase.of_map(spare, *stored_identity(spare / "places.sqlite"))) as places:
+            assert places.listed == range(len(folder.sessions)) and places.next_session >= len(folder.sessions)
         # and the drive is added, once
         grow(spare, run)
         folder = MapFolder.open(spare)

@@ -55,12 +55,6 @@ def test_odometry_is_read_back_as_it_was(folder: MapFolder, put: list[StoredOdom
             np.testing.assert_array_equal(ours.covariance, theirs.covariance)
 
 
-def test_odometry_of_an_earlier_release_is_refused(folder: MapFolder) -> None:
-    (folder.folder_of("a") / "odometry.npz").write_bytes(b"")
-    with pytest.raises(UmfError, match="rebuild the map from its recordings"):
-        folder.odometry_of("a")
-
-
 def test_a_graph_gets_it_on_another_clock_and_in_its_sessions() -> None:
     graph = PoseGraph(PoseGraphSettings())
     later = (one._replace(stamp_ns=one.stamp_ns + 70 * SECOND_NS) for one in messages(0, 1, 2, 500, 501, 502))

@@ -150,7 +150,9 @@ def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
         read_closures(tmp_path / "closures.csv")
 
 
-def test_a_verdict_of_another_version_keeps_its_state(tmp_path: Path) -> None:
-    path = written(tmp_path / "graph_verdicts.csv", [[MATCH_NS, QUERY_NS, "undecided", "a riddle", 1.5, 0.2]], VERDICTS)
+def test_verdicts_are_read_by_the_endpoints_of_the_closures(tmp_path: Path) -> None:
+    row = [MATCH_NS, QUERY_NS, State.PENDING, ClosureReason.UNSURE, 1.5, 0.2]
+    path = written(tmp_path / "graph_verdicts.csv", [row], VERDICTS)
     (found,) = read_verdicts(path, [closure()]).values()
-    assert (found.state, found.reason, found.residual) == (State.PENDING, ClosureReason.EARLIER_VERSION, 1.5)
+    assert (found.state, found.reason, found.residual) == (State.PENDING, ClosureReason.UNSURE, 1.5)
+    assert read_verdicts(path, []) == {} and read_verdicts(tmp_path / "none.csv", [closure()]) == {}

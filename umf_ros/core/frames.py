@@ -27,10 +27,6 @@ class State(StrEnum):
     REJECTED = "rejected"
     REFUSED = "refused"
 
-    @classmethod
-    def _missing_(cls, value: object) -> State | None:
-        return cls.PENDING if value in ("undecided", "waiting") else None  # names of earlier versions
-
 
 @dataclass(frozen=True, slots=True)
 class StereoCamera:

@@ -128,13 +128,10 @@ class Schema:
     Attributes:
         name: kind of the file, such as "place database"; for errors and the table `schema_version`.
         migrations: statements; the n-th ones lead from version n to n + 1; released ones are never changed.
-        unversioned: version of a file without `schema_version`, as earlier releases wrote it, by the names of its
-            tables; 0 where it is another kind of file.
     """
 
     name: str
     migrations: tuple[tuple[str, ...], ...]
-    unversioned: Callable[[set[str]], int] = lambda tables: 0
 
 
 class SqliteFile:
@@ -249,7 +246,7 @@ class SqliteFile:
         found, tables = self._version(schema), self._tables()
         if not found and (tables or self._read_only):
             held = shortened(", ".join(sorted(tables))) or "nothing"
-            raise UmfError(f"{self.name} is no {schema.name}: it holds {held}")
+            raise UmfError(f"{self.name} is no {schema.name}, or one of an earlier version: it holds {held}")
         if found and check is not None:
             check(self.connection)
         if not self._read_only:
@@ -268,7 +265,7 @@ class SqliteFile:
         tables, versions = self._tables(), dict[str, int]()
         if "schema_version" in tables:
             versions = dict(self.connection.execute("SELECT name, version FROM schema_version"))
-        found = int(versions.get(schema.name) or schema.unversioned(tables))
+        found = int(versions.get(schema.name, 0))
         if found > len(schema.migrations):
             latest = len(schema.migrations)
             raise UmfError(f"{self.name} has version {found} of a {schema.name}, this umf_ros reads {latest}")

@@ -111,8 +111,6 @@ class MapFolder:
 
     def odometry_of(self, name: str) -> list[StoredOdometry]:
         """Return the odometry of a recording, stamped by its own clock."""
-        if (self.folder_of(name) / "odometry.npz").is_file():
-            raise UmfError(f"{self.path} is from an earlier version of umf_ros; rebuild the map from its recordings")
         with closing(RunFile(self.folder_of(name), read_only=True)) as file:
             return list(file.odometry())
 

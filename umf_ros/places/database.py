@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from umf_ros.core.config import Database, Loop
 from umf_ros.core.errors import OutputError, UmfError, one_line
 from umf_ros.core.frames import Candidate, Keyframe, Points
-from umf_ros.core.geometry import Array
+from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import atomic_write
 from umf_ros.places.store import KeyframeStore, index_path
 
@@ -78,6 +79,9 @@ class PlaceDatabase:
         dimension: numbers per descriptor.
         read_only: only read the file; another process may write it.
 
+    Attributes:
+        listed: sessions that the map of these places lists; None where they are of no map.
+
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use.
     """
@@ -88,6 +92,7 @@ class PlaceDatabase:
         outgoing = settings.backend == "postgres" and not read_only
         self.store = KeyframeStore(path, identity, settings.cached_keyframes, read_only, outgoing)
         self._index_path = index_path(path) if path is not None else None
+        self.listed: range | None = None
         try:
             self.index = self._open_index(dimension)
         except BaseException:
@@ -96,7 +101,7 @@ class PlaceDatabase:
 
     @classmethod
     def of_map(cls, folder: Path, embedder: str, dimension: int) -> PlaceDatabase:
-        """Open the places of a map for reading.
+        """Open the places of a map for reading; those of sessions that it does not list are of an unfinished addition.
 
         Raises:
             UmfError: there is no map, or it was made with another embedder.
@@ -104,18 +109,20 @@ class PlaceDatabase:
         path = folder / PLACES_OF_MAP
         if not path.is_file():
             raise UmfError(f"{folder} is not a map: {PLACES_OF_MAP} is missing; make one with umf map")
-        return cls(Database(path=str(path)), embedder, dimension, read_only=True)
+        places = cls(Database(path=str(path)), embedder, dimension, read_only=True)
+        try:
+            sessions = json.loads((folder / "map.json").read_text(encoding="utf-8"))["sessions"]
+            places.listed = range(max((one["first_number"] + one["numbers"] for one in sessions), default=0))
+        except (OSError, ValueError, LookupError, TypeError):
+            places.close()
+            raise UmfError(f"{folder / 'map.json'} is missing or damaged") from None
+        return places
 
     def __len__(self) -> int:
         return len(self.store)
 
     def __getitem__(self, index: int) -> Keyframe:
         return self.store[index]
-
-    def index_of(self, stamp_ns: int, session: int) -> int | None:
-        """Return the index of a keyframe by its key; None when it is not there."""
-        sessions = self.store.keys["session"]
-        return next((row for row in reversed(self.store.rows_at(stamp_ns)) if sessions[row] == session), None)
 
     def newest_at(self, stamp_ns: int) -> int | None:
         """Return the index of the newest keyframe of a stamp; None when there is none."""
@@ -190,7 +197,6 @@ class PlaceDatabase:
         if index is None or not self._matches(index):
             if path is not None and not self.store.read_only:
                 path.unlink(missing_ok=True)
-                path.with_suffix(".codes").unlink(missing_ok=True)  # index of earlier versions
             index = PlaceIndex(dimension)
         self._saved = len(index)
         for first in range(len(index), size, BATCH):
@@ -201,7 +207,7 @@ class PlaceDatabase:
     def _matches(self, index: PlaceIndex) -> bool:
         if not 0 < len(index) <= len(self.store):
             return False
-        rows = np.unique(np.linspace(0, len(index) - 1, SPOT_CHECKS).astype(np.intp))
+        rows = evenly(len(index), SPOT_CHECKS)
         return bool(np.abs(index.descriptors(rows) - self.store.descriptors(rows)).max() < SAME_NUMBER)
 
     def _save_index(self) -> None:
@@ -275,7 +281,7 @@ class PlaceIndex:
             return
         size = min(DIRECTIONS, self._flat.d)
         with _one_thread() as faiss:
-            sample = self.descriptors(np.unique(np.linspace(0, len(self) - 1, SAMPLE).astype(np.intp)))
+            sample = self.descriptors(evenly(len(self), SAMPLE))
             # principal axes without centring, unlike those of faiss.PCAMatrix: it would change the order of products
             axes = np.linalg.eigh(sample.T @ sample)[1][:, -size:]
             projection = faiss.LinearTransform(self._flat.d, size, False)

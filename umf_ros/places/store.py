@@ -34,10 +34,7 @@ SCHEMA = Schema(
         # covers the keys of all keyframes on a hundredth of the pages
         ("CREATE INDEX IF NOT EXISTS keyframe_by_stamp ON keyframe (stamp_ns, session, travelled_m)",),
     ),
-    unversioned=lambda tables: int({"about", "keyframe"} <= tables),
 )
-UNVERSIONED_FORMAT = "3"
-"""Format of the files without `schema_version` that are converted; earlier ones are refused."""
 OUTBOX = Schema(
     "outbox",
     migrations=(
@@ -49,7 +46,6 @@ OUTBOX = Schema(
             "INSERT INTO fleet VALUES (lower(hex(randomblob(16))))",
         ),
     ),
-    unversioned=lambda tables: int({"fleet", "outbox"} <= tables),
 )
 LARGEST_NUMBER = 2**53
 MOTION = "motion"
@@ -323,10 +319,8 @@ def _identity(connection: sqlite3.Connection) -> dict[str, Any]:
 
 
 def _check_identity(connection: sqlite3.Connection, name: str, identity: dict[str, str]) -> None:
-    """Raise an `UmfError` if the file `name` has another embedder, or a format that is not converted."""
+    """Raise an `UmfError` if the file `name` has another embedder."""
     stored = _identity(connection)
-    if stored.get("schema", UNVERSIONED_FORMAT) != UNVERSIONED_FORMAT:
-        raise UmfError(f"{name} was written by another version of umf_ros; name a new file (database.path)")
     wrong = [f"{key} {stored.get(key)}, not {value}" for key, value in identity.items() if stored.get(key) != value]
     if stored and wrong:
         raise UmfError(f"{name} was made with {'; '.join(wrong)}")

@@ -51,11 +51,6 @@ class ClosureReason(StrEnum):
     COVARIANCE_NOT_FINITE = "covariance is not finite"
     COVARIANCE_ASYMMETRIC = "covariance is not symmetric"
     COVARIANCE_NOT_POSITIVE = "covariance is not positive definite"
-    EARLIER_VERSION = "decided by an earlier version"
-
-    @classmethod
-    def _missing_(cls, value: object) -> ClosureReason | None:
-        return cls.EARLIER_VERSION if isinstance(value, str) else None
 
 
 Decision = tuple[State, ClosureReason, float, float]

@@ -62,7 +62,7 @@ def by_need(pairs: Pairs) -> list[Endpoints]:
 
 def _spread(count: int, most: int) -> Iterable[int]:
     """Return up to `most` of `count` indices, coarse before fine: the first ones cover the whole run."""
-    kept = np.linspace(0, count - 1, min(count, most)).astype(int).tolist() if count else []
+    kept = evenly(count, most).tolist()
     strides = [1 << power for power in range(len(kept).bit_length(), -1, -1)]
     return list(dict.fromkeys(kept[i] for stride in strides for i in range(0, len(kept), stride)))
 
