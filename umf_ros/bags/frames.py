@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from umf_ros.absolute.measurement import ABSOLUTE_TYPES, AbsoluteDecoder, AbsoluteMeasurement, Aid
+from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.reader import Bag, decode
 from umf_ros.bags.storages import RawMessage
+from umf_ros.bags.trajectories import decode_ground_truth
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics, topics_of
 from umf_ros.core.errors import BagError, MessageError, either
@@ -59,6 +61,7 @@ class FrameReader:
         self._bag, self._odometry, self._rows_taken = bag, odometry, 0
         self._synchronizer = Synchronizer(settings.sync, calibration, inputs, warn)
         self._samples: list[OdometrySample] = []
+        self._truth: list[RawMessage] = []
         transforms = read_transforms(bag) if settings.uses_transforms else StaticTransforms()
         known = transforms.version or calibration.is_open
         frames = BodyFrames(settings.frames, transforms, warn, 0.0, calibration) if known else None
@@ -84,10 +87,17 @@ class FrameReader:
             yield from self._take(raw)
         yield from self._synchronizer.flush()
 
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The recording's ground truth as far as `graph_stream` was read; None without; raises a `BagError`."""
+        return decode_ground_truth(self._bag, self._truth)
+
     def graph_stream(self) -> Iterator[Frame | OdometrySample | AbsoluteMeasurement]:
         """Yield the same with absolute measurements, which only a pose graph takes."""
-        for raw in self._bag.raw_messages([*self._router.topics, *self._absolute]):
-            if raw.topic in self._absolute:
+        for raw in self._bag.raw_messages([*self._router.topics, *self._absolute, GROUND_TRUTH_TOPIC]):
+            if raw.topic == GROUND_TRUTH_TOPIC:
+                self._truth.append(raw)
+            elif raw.topic in self._absolute:
                 yield from self._take_absolute(raw)
             else:
                 yield from self._take(raw)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import nan
 from typing import Any
@@ -18,7 +18,6 @@ from umf_ros.core.frames import Frame, Image, Points
 from umf_ros.core.geometry import Array, invert
 from umf_ros.core.trajectory import Trajectory, interpolated
 from umf_ros.embedding.depth import disparities
-from umf_ros.sensors.decode import OdometrySample
 
 SCAN_CELL_M, SCAN_REACH_M = 0.4, 1.0  # by hand: consecutive scans, a quarter of a metre apart
 CELL_MASK = 2**21 - 1  # three coordinates in one number: a scan is far narrower than two million cells
@@ -308,20 +307,6 @@ class SensorCheck:
         if earlier.image_stamp_ns and later.image_stamp_ns:
             found = view_step(earlier, later)
             self._view_steps += [found] if found else []
-
-
-def check_stream(stream: Iterable[Frame | OdometrySample], odometry: Trajectory | None = None) -> SensorReport:
-    """Check the frames of a recording against its odometry, or against `odometry` where it has none."""
-    check, stamps, poses = SensorCheck(), [-1], list[Array]([np.eye(4)])
-    for item in stream:
-        if isinstance(item, Frame):
-            check.take(item)
-        elif item.stamp_ns > stamps[-1]:  # as far as its stamps grow
-            stamps.append(item.stamp_ns)
-            poses.append(item.odom_T_body)
-    return check.report(
-        Trajectory(np.array(stamps[1:], np.int64), np.stack(poses)[1:]) if len(stamps) > 1 else odometry
-    )
 
 
 def _forward(odometry: Trajectory) -> Array | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from decimal import Decimal
 from pathlib import Path
 
@@ -9,11 +10,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
-from umf_ros.bags.reader import Bag
+from umf_ros.bags.reader import Bag, decode
+from umf_ros.bags.storages import RawMessage
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import BagError, MessageError
 from umf_ros.core.geodesy import to_enu
-from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose, stamp_ns
@@ -81,17 +82,16 @@ def read_ground_truth(bag: Bag | None, path: str | Path | None = None) -> Trajec
         return read_rtklib(path)
     if bag is None or GROUND_TRUTH_TOPIC not in bag.topics:
         return None
-    found: list[tuple[int, Array]] = []
-    for _, _, message in bag.messages([GROUND_TRUTH_TOPIC]):
-        try:
-            stamp, pose = stamp_ns(message), decode_pose(message.pose)
-        except MessageError as error:
-            raise BagError(f"{bag.path}: ground truth holds a {error}") from None
-        if not found or stamp > found[-1][0]:  # the first session
-            found.append((stamp, pose))
-    if not found:
-        return None
-    return Trajectory(np.array([stamp for stamp, _ in found], np.int64), np.stack([pose for _, pose in found]))
+    return decode_ground_truth(bag, bag.raw_messages([GROUND_TRUTH_TOPIC]))
+
+
+def decode_ground_truth(bag: Bag, messages: Iterable[RawMessage]) -> Trajectory | None:
+    """Return the ground truth of the first session from messages of a recording, or None; raises a `BagError`."""
+    try:
+        found = [decode(raw) for raw in messages]
+        return Trajectory.rising((stamp_ns(one), decode_pose(one.pose)) for one in found)
+    except MessageError as error:
+        raise BagError(f"{bag.path}: ground truth holds a {error}") from None
 
 
 def _to_ns(seconds: str) -> int:

@@ -79,9 +79,10 @@ def command(
     from umf_ros.core.watchdog import watching
     from umf_ros.detector import LoopDetector, make_detector_embedder
     from umf_ros.replay import Replay
-    from umf_ros.runs.reader import remember_recording
+    from umf_ros.runs.reader import read_run, remember_recording
     from umf_ros.runs.report import finish_run
     from umf_ros.runs.rerun_log import RerunLog
+    from umf_ros.runs.run_file import read_odometry_of
     from umf_ros.runs.writer import count_drops, create_folder, finish_folder, unfinished_folder, with_places
 
     console = Console()
@@ -98,7 +99,7 @@ def command(
     _tell_inputs(console, settings)
     warnings: list[str] = []
     reader = open_frames(recording, settings, partial(_warn, console, warnings), odometry, odometry_frame)
-    read_ground_truth(None, ground_truth)  # reports its errors before the run
+    truth = read_ground_truth(None, ground_truth)
     if settings.localizing and rerun:
         raise ConfigError("--rerun is for mapping runs: leave it out with --map")
     network = make_detector_embedder(settings)
@@ -142,8 +143,10 @@ def command(
         if settings.localizing:
             status = _report_localization(console, folder, replay.counts, newest)
         else:
-            shown = frozenset(warnings + absent)
-            status = finish_run(folder, recording, console, ground_truth, shown, replay.sensor_check).exit_code
+            truth = truth or (read_ground_truth(recording) if interrupted() else reader.ground_truth)
+            sensors = replay.sensor_check.report(read_odometry_of(folder))
+            run = read_run(folder, recording, truth)
+            status = finish_run(run, recording, console, sensors, frozenset(warnings + absent)).exit_code
     replay.raise_if_frames_failed()
     raise typer.Exit(status)
 

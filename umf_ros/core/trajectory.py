@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,6 +54,19 @@ class Trajectory:
     stamps_ns: NDArray[np.int64]
     poses: Array
     has_orientation: bool = True
+
+    @classmethod
+    def rising(cls, samples: Iterable[tuple[int, Array]]) -> Trajectory | None:
+        """Return the stamped poses (4, 4) that are later than all before them; None without any."""
+        kept: list[tuple[int, Array]] = []
+        for stamp_ns, pose in samples:
+            if not kept or stamp_ns > kept[-1][0]:
+                kept.append((stamp_ns, pose))
+        return (
+            cls(np.array([stamp for stamp, _ in kept], np.int64), np.stack([pose for _, pose in kept]))
+            if kept
+            else None
+        )
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

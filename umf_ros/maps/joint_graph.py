@@ -89,22 +89,17 @@ def solve(folder: MapFolder, edits: Mapping[tuple[int, int], State] | None = Non
         ends = (verdict.closure.query_stamp_ns, verdict.closure.match_stamp_ns)
         query, match = (folder.session_at(stamp) for stamp in ends)
         verdicts[query is not match].append(verdict)
-    sessions = [_placed(folder, session, graph, _trajectory(odometry[session.name])) for session in folder.sessions]
+    sessions = [_placed(folder, session, graph, odometry[session.name]) for session in folder.sessions]
     return JointMap(graph, sessions, *verdicts)
 
 
-def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, own: Trajectory) -> JointSession:
+def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, odometry: list[StoredOdometry]) -> JointSession:
     """Return a session with the poses of its keyframes in the solved map."""
     stamps = read_keyframes(folder.folder_of(session.name) / "keyframes.csv")["stamp_ns"]
     poses, known = graph.poses_at(stamps + session.shift_ns)
-    odometry, _ = own.at(stamps[known])
-    return JointSession(session, bool(known.any()), stamps[known], poses[known], odometry)
-
-
-def _trajectory(odometry: list[StoredOdometry]) -> Trajectory:
-    """Return the poses in the order of their stamps, the first one of each stamp."""
-    stamps, first = np.unique(np.array([one.stamp_ns for one in odometry], np.int64), return_index=True)
-    return Trajectory(stamps, np.array([odometry[row].odom_T_body for row in first]).reshape(-1, 4, 4))
+    own = Trajectory.rising((one.stamp_ns, one.odom_T_body) for one in sorted(odometry, key=lambda one: one.stamp_ns))
+    by_odometry = own.at(stamps[known])[0] if own is not None else np.empty((0, 4, 4))
+    return JointSession(session, bool(known.any()), stamps[known], poses[known], by_odometry)
 
 
 def _shifted(closure: LoopClosure, shift_ns: int) -> LoopClosure:

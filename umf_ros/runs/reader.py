@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.bags.reader import Bag
-from umf_ros.bags.trajectories import read_ground_truth, read_tum
+from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure, Points
@@ -73,8 +73,8 @@ class FinishedRun:
         return dict(run_file.read_table(path, lambda row: (int(row["stamp_ns"]), float(row["total"]))))
 
 
-def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = None) -> FinishedRun:
-    """Read a run folder, and the truth from a file or from the recording.
+def read_run(folder: Path, bag: Bag | None = None, truth: Trajectory | None = None) -> FinishedRun:
+    """Read a run folder.
 
     Raises:
         UmfError: the folder holds no run, a file is damaged, or the run was made on another recording.
@@ -90,7 +90,7 @@ def read_run(folder: Path, bag: Bag | None = None, ground_truth: Path | None = N
         verdicts=run_file.read_verdicts(folder / "graph_verdicts.csv", closures),
         odometry=_trajectory(folder / "trajectory_odometry.tum"),
         optimized=_trajectory(folder / "trajectory_optimized.tum"),
-        truth=read_ground_truth(bag, ground_truth),
+        truth=truth,
     )
     if bag is not None:
         _check_recording(run, bag)

@@ -22,21 +22,18 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as Grid
 
-from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.reader import Bag
-from umf_ros.bags.sensor_check import SensorCheck, SensorReport, check_stream
-from umf_ros.bags.trajectories import read_odometry
+from umf_ros.bags.sensor_check import SensorReport
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Image, LoopClosure
 from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import write_atomically
-from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.findings import RunVerdict, conclude, look_first
 from umf_ros.runs.gallery import Gallery, read_gallery
-from umf_ros.runs.reader import FinishedRun, read_run
-from umf_ros.runs.run_file import Endpoints, read_inliers, read_odometry_of
+from umf_ros.runs.reader import FinishedRun
+from umf_ros.runs.run_file import Endpoints, read_inliers
 from umf_ros.runs.scene import build_scene, by_need, drawn_trajectory, named_curves, pairs_of, size_of
 from umf_ros.runs.truth import MEDIAN_EXPECTED, Judged, JudgedRun, in_words, judge_run
 from umf_ros.runs.writer import write_summary
@@ -261,35 +258,31 @@ MAX_SHOWN = 400
 
 
 def finish_run(
-    folder: Path,
+    run: FinishedRun,
     bag: Bag,
     console: Console,
-    ground_truth: Path | None = None,
+    sensors: SensorReport,
     printed: frozenset[str] = frozenset(),
-    check: SensorCheck | None = None,
 ) -> RunVerdict:
     """Judge a run, write its pictures and its report, print its summary, and return the verdict.
 
     Args:
-        folder: of the run.
-        bag: the recording the run was made on; with another one an `UmfError` is raised and nothing is written.
+        run: the run, with its truth.
+        bag: the recording the run was made on.
         console: where the summary is printed.
-        ground_truth: RTKLIB .pos or TUM file; None takes that of the recording, if there is one.
+        sensors: check of the recording's sensors.
         printed: lines that were printed before the run, and are not repeated.
-        check: sensor check fed with the recording's frames; None: the recording is read for one.
     """
-    run = read_run(folder, bag, ground_truth)
     with console.status("Judging, drawing and writing the report"):
-        about = judge(run, bag)
+        about = replace(judge(run, bag), sensors=sensors)
         draw_trajectory(about)
-        inliers = read_inliers(folder / "inliers.csv")
+        inliers = read_inliers(run.folder / "inliers.csv")
         pairs = pairs_of(about)
         shown = [stamp for key in by_need(pairs)[:MAX_SHOWN] for stamp in key]
         rows = evenly(len(run.closures), MAX_PICTURES)
         chosen = [run.closures[row] for row in rows]
         drawn = {*shown, *(stamp for one in chosen for stamp in one.endpoints)}
-        gallery = read_gallery(folder, drawn, drawn_trajectory(about))
-        about = replace(about, sensors=_report_sensors(run, bag, check))
+        gallery = read_gallery(run.folder, drawn, drawn_trajectory(about))
         _draw_matches(about, chosen, gallery, inliers)
         findings = look_first(about)
         verdict = conclude(about, findings)
@@ -349,19 +342,3 @@ def _draw_matches(
 
     with ThreadPoolExecutor() as pool:
         list(pool.map(draw, chosen))
-
-
-def _report_sensors(run: FinishedRun, bag: Bag, check: SensorCheck | None) -> SensorReport:
-    """Compare the checked frames, or else those of the recording, with the odometry."""
-    if check is not None:
-        return check.report(read_odometry_of(run.folder) or run.odometry)
-    stream = FrameReader(bag, run.settings, _odometry_file(run), warn=lambda _: None).stream()
-    return check_stream(stream, run.odometry)
-
-
-def _odometry_file(run: FinishedRun) -> Trajectory | None:
-    """Return the odometry that the run took from a file, if the file still exists."""
-    named = run.summary.get("odometry_file")
-    if not named or not Path(named["path"]).is_file():
-        return None
-    return read_odometry(named["path"], named["frame"], run.settings)

@@ -267,12 +267,7 @@ def read_descriptors(folder: Path) -> dict[int, Points]:
 def read_odometry_of(folder: Path) -> Trajectory | None:
     """Return the recorded odometry messages of a run with increasing stamps; None without any."""
     with closing(RunFile(folder, read_only=True)) as file:
-        messages = [one for one in file.odometry() if one.covariance is None]
-    if not messages:
-        return None
-    stamps = np.array([one.stamp_ns for one in messages], np.int64)
-    newer = np.flatnonzero(stamps > np.maximum.accumulate(np.concatenate([[-1], stamps[:-1]])))
-    return Trajectory(stamps[newer], np.stack([messages[row].odom_T_body for row in newer]))
+        return Trajectory.rising(one[:2] for one in file.odometry() if one.covariance is None)
 
 
 def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:

@@ -30,9 +30,9 @@ def command(
     from umf_ros.commands.console import undisturbed
     from umf_ros.core.io import check_writable, create_run_folder
     from umf_ros.lab.commands import simulate
+    from umf_ros.lab.commands.report import report_run
     from umf_ros.lab.live.live_graph import LiveGraph
     from umf_ros.runs.reader import remember_recording
-    from umf_ros.runs.report import finish_run
 
     console = Console()
     check_writable(out)
@@ -45,7 +45,7 @@ def command(
         graph.play(bag, recording.duration_s, rate)
     with undisturbed():
         remember_recording(folder, recording)
-        finish_run(folder, recording, console)
+        report_run(folder, recording, console)
 
 
 def play(

@@ -36,12 +36,31 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
-    from umf_ros.runs.report import finish_run
     from umf_ros.runs.writer import read_summary
 
     recover_run(folder)
     read_summary(folder)
-    finish_run(folder, open_bag(bag), Console(), ground_truth)
+    report_run(folder, open_bag(bag), Console(), ground_truth)
+
+
+def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | None = None) -> None:
+    """Judge a run and write its report; the sensors are checked, and the truth is read, by reading the recording again.
+
+    Raises:
+        UmfError: the run was made on another recording; nothing is written.
+    """
+    from umf_ros.bags.trajectories import read_ground_truth, read_odometry
+    from umf_ros.lab.evaluation.sensors_run import check_sensors
+    from umf_ros.runs.reader import read_run
+    from umf_ros.runs.report import finish_run
+
+    run = read_run(folder, bag, read_ground_truth(bag, ground_truth))
+    named, odometry = run.summary.get("odometry_file"), None
+    if named and Path(named["path"]).is_file():
+        odometry = read_odometry(named["path"], named["frame"], run.settings)
+    with console.status("Checking the sensors"):
+        sensors = check_sensors(bag, run.settings, odometry, run.odometry)
+    finish_run(run, bag, console, sensors)
 
 
 def why(
@@ -59,6 +78,7 @@ def why(
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
+    from umf_ros.bags.trajectories import read_ground_truth
     from umf_ros.runs.diagnosis import explain
     from umf_ros.runs.reader import read_run
     from umf_ros.runs.report import judge
@@ -68,7 +88,8 @@ def why(
     summary = read_summary(folder)
     known = bag or Path(summary.get("recording", {}).get("path", ""))
     recording: Bag | None = open_bag(known) if bag or known.is_file() or (known.is_dir() and known.name) else None
-    about = judge(read_run(folder, recording, ground_truth), recording, keep=False)
+    truth = read_ground_truth(recording, ground_truth)
+    about = judge(read_run(folder, recording, truth), recording, keep=False)
     if not len(about.run.keyframes):
         raise UmfError(f"{folder} holds no keyframe")
     asked_ns = _stamp(moment, int(about.run.stamps[0]))

@@ -16,17 +16,22 @@ from rich.console import Console
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
-from umf_ros.bags.sensor_check import SensorReport, check_stream
+from umf_ros.bags.sensor_check import SensorCheck, SensorReport
+from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Frame
 from umf_ros.core.tasks import spread
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.evaluation.results import TextTable
 from umf_ros.replay import Replay
 from umf_ros.runs.reader import read_run, remember_recording
 from umf_ros.runs.report import finish_run, judge
+from umf_ros.runs.run_file import read_odometry_of
 from umf_ros.runs.truth import JudgedRun
 from umf_ros.runs.writer import count_drops
+from umf_ros.sensors.decode import OdometrySample
 
 _NOTHING = "/none"
 SENSORS: dict[str, dict[str, Any]] = {
@@ -86,9 +91,24 @@ def stretches_of(bag: Path) -> list[Stretch]:
     return [*named, whole] if len(named) > 1 else [whole]
 
 
-def check_sensors(bag: Bag, settings: Settings) -> SensorReport:
-    """Return the check of a recording's measurements against each other."""
-    return check_stream(FrameReader(bag, settings, warn=lambda _: None).stream())
+def check_sensors(
+    bag: Bag, settings: Settings, odometry: Trajectory | None = None, instead: Trajectory | None = None
+) -> SensorReport:
+    """Check the sensors of a recording against its odometry.
+
+    Args:
+        bag: the recording.
+        settings: to read it with.
+        odometry: that of a file, which replaces that of the recording.
+        instead: odometry for a recording without any.
+    """
+    check, samples = SensorCheck(), list[OdometrySample]()
+    for item in FrameReader(bag, settings, odometry, warn=lambda _: None).stream():
+        if isinstance(item, Frame):
+            check.take(item)
+        else:
+            samples.append(item)
+    return check.report(Trajectory.rising(samples) or instead)
 
 
 def replay_all(
@@ -102,7 +122,8 @@ def replay_all(
     tasks = [SensorTask(name, bag, config, folder / name.replace(" ", "_"), report) for name in SENSORS]
     spread(replay, tasks, workers, done=done)
     recording = open_bag(bag)
-    return {task.name: judge(read_run(task.folder, recording), recording) for task in tasks}
+    truth = read_ground_truth(recording)
+    return {task.name: judge(read_run(task.folder, recording, truth), recording) for task in tasks}
 
 
 def replay(task: SensorTask) -> None:
@@ -112,13 +133,15 @@ def replay(task: SensorTask) -> None:
     task.folder.mkdir(parents=True)
     run = Replay(task.folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
     reader = FrameReader(recording, settings, None, warn=lambda text: None)
-    for _ in run.run(reader.stream()):
+    for _ in run.run(reader.graph_stream()):
         pass
     run.finish(count_drops(reader.counters))
     run.raise_if_frames_failed()
     remember_recording(task.folder, recording)
     if task.report:
-        finish_run(task.folder, recording, Console(file=StringIO()))
+        finished = read_run(task.folder, recording, reader.ground_truth)
+        sensors = run.sensor_check.report(read_odometry_of(task.folder))
+        finish_run(finished, recording, Console(file=StringIO()), sensors)
 
 
 def score(about: JudgedRun, stretches: Sequence[Stretch]) -> dict[str, StretchScore]:
