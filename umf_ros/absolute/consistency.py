@@ -47,13 +47,12 @@ _LEAST_SIGMA_M = 0.05
 _STEP = np.log(1.2)
 MOST_HELD = 400
 """Factors of a session and source: each is a vertex, and all are solved with every event (*by hand*: over 4 km)."""
-# by this factor the path grows until all is decided again; until then, only what its end can change
-_REJUDGE = 1.1
 
 Rows = NDArray[np.int64]
 Decision = tuple[State, AbsoluteReason]
 _AGREES = State.ACCEPTED, AbsoluteReason.AGREES
 _INCOMPLETE = State.PENDING, AbsoluteReason.INCOMPLETE
+_UNSURE = State.PENDING, AbsoluteReason.UNSURE
 _JUMPED = State.REJECTED, AbsoluteReason.JUMPED
 _CONTRADICTS = State.REJECTED, AbsoluteReason.CONTRADICTS
 _MOUNTED_WRONG = State.REJECTED, AbsoluteReason.MOUNTING
@@ -70,9 +69,7 @@ def attitude_drift(noise: OdometryNoise, path_m: Array) -> Array:
     return (noise.scale * noise.sigma_rad) ** 2 * path_m + (_SYSTEMATIC_RAD * path_m) ** 2
 
 
-def longest_chain(
-    values: Array, variances: Array, path_m: Array, drift: Array, known: NDArray[np.bool_] | None = None
-) -> NDArray[np.bool_]:
+def longest_chain(values: Array, variances: Array, path_m: Array, drift: Array) -> NDArray[np.bool_]:
     """(N,) members of the longest chain of measurements along the path.
 
     Args:
@@ -80,14 +77,9 @@ def longest_chain(
         variances: (N, 3) of the values.
         path_m: (N,) where they are along the path, rising.
         drift: (K,) variance of the drift over 0, 1, 2, ... metres; beyond, the last.
-        known: (M,) whether the first M are members, as was found before.
     """
     best, before = np.ones(len(values)), np.full(len(values), -1)
-    begun = 0 if known is None else len(known)
-    if known is not None:  # members go on with the chain that led to them
-        rows = np.flatnonzero(known)
-        best[rows], before[rows[1:]] = np.arange(1, len(rows) + 1), rows[:-1]
-    for row in range(max(1, begun), len(values)):
+    for row in range(1, len(values)):
         start = max(0, row - _REACH)
         apart = drift[np.minimum((path_m[row] - path_m[start:row]).astype(int), len(drift) - 1)]
         spread = variances[start:row] + variances[row] + apart[:, None]
@@ -196,11 +188,6 @@ class MeasuredPath:
     finished: int
     at_middle: Callable[[int], tuple[int, Array]]
 
-    def since(self, row: int) -> MeasuredPath:
-        """The path from a measurement on."""
-        parts = self.odometry[row:], self.poses[row:], self.travel[row:]
-        return MeasuredPath(*parts, self.finished, self.at_middle)
-
 
 @dataclass(frozen=True)
 class _Stretches:
@@ -240,22 +227,20 @@ class Track:
         self._measurements: list[AbsoluteMeasurement] = []
         self._decisions: list[Decision] = []
         self._misfits = self._distances = np.empty(0)
+        self._levers = self._variances = np.empty((0, 3))
         self._solved: set[int] = set()
-        self._chain: set[int] = set()  # stretches
-        self._judged = self._judged_whole = 0
-        self._scale, self._mounted = 1.0, _AGREES
+        self._scale = 1.0
         self.mounting: Array | None = None
         self.factors: dict[int, Factor] = {}
 
     def add(self, measurements: list[AbsoluteMeasurement]) -> None:
         """Take measurements; their verdicts are open until `judge`."""
-        known, last_ns = len(self._measurements), self._measurements[-1].stamp_ns if self._measurements else 0
         self._measurements = sorted([*self._measurements, *measurements], key=lambda one: one.stamp_ns)
+        self._levers = np.array([one.lever for one in self._measurements])
+        self._variances = np.array([np.diag(one.covariance) for one in self._measurements])
         self._decisions += [_INCOMPLETE] * len(measurements)
         more = np.full(len(measurements), np.nan)
         self._misfits, self._distances = np.append(self._misfits, more), np.append(self._distances, more)
-        if self._measurements[known:] and min(one.stamp_ns for one in measurements) < last_ns:
-            self._judged_whole = 0
 
     @property
     def held(self) -> dict[int, Factor]:
@@ -293,60 +278,33 @@ class Track:
             return None
         return make_pose(turned(np.eye(3), direction).T, np.median(ends[0] - turned(ends[1], direction), axis=0))
 
-    def judge(self, measured: Array, path: MeasuredPath, in_world: bool, at_last: bool = False) -> None:
-        """Decide about measurements; `measured` (N, 3) are positions in the world, or upward directions.
-
-        About all of them now and then and at last, else about those of the newest stretches.
-        """
+    def judge(self, measured: Array, path: MeasuredPath, in_world: bool) -> None:
+        """Decide about all measurements; `measured` (N, 3) are positions in the world, or upward directions."""
+        self.factors = {}
+        self._decide_all(_INCOMPLETE if self.mounting is None else _MOUNTED_WRONG)
         if self.mounting is not None:
-            self.factors = {}
-            self._decide_all(_MOUNTED_WRONG)
             return
-        first = self._judged - 2 * _REACH
-        whole = at_last or first <= 0 or path.finished > _REJUDGE * self._judged_whole
-        row = 0 if whole else int(np.searchsorted(path.travel, first * STRETCH_M))
-        if whole:
-            self._decide_all(_INCOMPLETE)
-            self.factors, self._judged_whole = {}, path.finished
-        self._judge_since(row, measured[row:], path.since(row), in_world, whole)
-        self._judged = path.finished
-
-    def _judge_since(self, row: int, measured: Array, path: MeasuredPath, in_world: bool, whole: bool) -> None:
-        """Decide about the measurements of stretches from a row on; what comes before is context unless it is `whole`.
-
-        `measured` (M, 3) and the path begin there.
-        """
-        levers, variances = self._levers[row:], self._variances[row:]
-        values, rotations = self._drifting(measured, path, levers)
-        if whole:
-            self._scale = _scatter(values, variances, _Stretches.of(values, variances, path))
-        variances = self._scale**2 * variances
+        values, rotations = self._drifting(measured, path)
+        self._scale = _scatter(values, self._variances, _Stretches.of(values, self._variances, path))
+        variances = self._scale**2 * self._variances
         stretches = _Stretches.of(values, variances, path)
         parts = stretches.middles, stretches.spreads, stretches.travel, self._drift
-        begun = 0 if whole else int(np.searchsorted(stretches.cells, self._judged - _REACH))
-        known = np.array([cell in self._chain for cell in stretches.cells[:begun].tolist()], bool)
-        members = longest_chain(*parts, known)
-        firm = supported(members, *parts[1:])
-        self._chain = {cell for cell in self._chain if cell < stretches.cells[0]} if len(members) else set()
-        self._chain |= set(stretches.cells[members].tolist())
-        if whole:
-            self._mounted = self._judge_mounting(stretches, members, rotations)
+        members = longest_chain(*parts)
+        firm, mounted = supported(members, *parts[1:]), self._judge_mounting(stretches, members, rotations)
         if in_world:
-            missed = self._missed(measured, path, levers)
-            self._misfits[row:] = np.linalg.norm(missed, axis=1)
-            self._distances[row:] = (missed**2 / variances).sum(axis=1)
-        for number in range(begun, len(stretches.rows)):
-            rows, cell = stretches.rows[number], int(stretches.cells[number])
-            self.factors.pop(cell, None)
-            if not firm[number] or self._mounted != _AGREES:
-                unsure = State.PENDING, AbsoluteReason.UNSURE
-                reason = _JUMPED if not members[number] else unsure if not firm[number] else self._mounted
-                self._decide(row + rows, reason)
-                continue
-            near = ((values[rows] - stretches.middles[number]) ** 2 / variances[rows]).sum(axis=1) <= GATE
-            kept = self._judge_stretch(cell, row + rows, near) - row
-            if len(kept):
-                self._average(cell, kept, measured, path, levers, row)
+            missed = self._missed(measured, path)
+            self._misfits = np.linalg.norm(missed, axis=1)
+            self._distances = (missed**2 / variances).sum(axis=1)
+        for cell, rows, middle, member, sure in zip(
+            stretches.cells.tolist(), stretches.rows, stretches.middles, members, firm, strict=True
+        ):
+            if sure and mounted == _AGREES:
+                near = ((values[rows] - middle) ** 2 / variances[rows]).sum(axis=1) <= GATE
+                kept = self._judge_stretch(cell, rows, near)
+                if len(kept):
+                    self._average(cell, kept, measured, path)
+            else:
+                self._decide(rows, mounted if sure else _UNSURE if member else _JUMPED)
 
     def _judge_stretch(self, cell: int, rows: Rows, near: NDArray[np.bool_]) -> Rows:
         """Decide about the measurements of a stretch that is consistent with others; returns those that are accepted.
@@ -364,14 +322,6 @@ class Track:
             self._solved.add(cell)
         return rows[agrees]
 
-    @property
-    def _levers(self) -> Array:
-        return np.array([one.lever for one in self._measurements])
-
-    @property
-    def _variances(self) -> Array:
-        return np.array([np.diag(one.covariance) for one in self._measurements])
-
     def _decide(self, rows: Rows, decision: Decision) -> None:
         for row in rows.tolist():
             self._decisions[row] = decision
@@ -380,7 +330,7 @@ class Track:
         self._decisions = [decision] * len(self._measurements)
         self._misfits, self._distances = np.full((2, len(self._measurements)), np.nan)
 
-    def _drifting(self, measured: Array, path: MeasuredPath, levers: Array) -> tuple[Array, Array]:
+    def _drifting(self, measured: Array, path: MeasuredPath) -> tuple[Array, Array]:
         """(N, 3) what drifts slowly, and the rotations (N, 3, 3) of the body with which an error of its mounting turns.
 
         Positions less those by dead reckoning with the attitudes of the map; directions by the odometry's attitudes.
@@ -389,7 +339,7 @@ class Track:
             return apply(path.odometry, measured), path.odometry[:, :3, :3]
         steps = invert(path.odometry[:-1]) @ path.odometry[1:]
         walked = np.cumsum(np.concatenate([np.zeros((1, 3)), apply(path.poses[:-1], steps[:, :3, 3])]), axis=0)
-        return measured - walked - apply(path.poses, levers), path.poses[:, :3, :3]
+        return measured - walked - apply(path.poses, self._levers), path.poses[:, :3, :3]
 
     def _judge_mounting(self, stretches: _Stretches, members: NDArray[np.bool_], rotations: Array) -> Decision:
         """Whether a source may be accepted, by what its error does when the rover turns."""
@@ -411,24 +361,21 @@ class Track:
             return _MOUNTED_WRONG
         return _AGREES
 
-    def _missed(self, measured: Array, path: MeasuredPath, levers: Array) -> Array:
+    def _missed(self, measured: Array, path: MeasuredPath) -> Array:
         """(N, 3) by what the measurements miss the map."""
         if self._source is Aid.GRAVITY:
             return apply(path.poses, measured) - [0.0, 0.0, 1.0]
-        return measured - path.poses[:, :3, 3] - apply(path.poses, levers)
+        return measured - path.poses[:, :3, 3] - apply(path.poses, self._levers)
 
-    def _average(self, cell: int, rows: Rows, measured: Array, path: MeasuredPath, levers: Array, first: int) -> None:
-        """Make the factor of a stretch: on a rigid path, the mean of positions is that of the mean of their levers.
-
-        `rows` count from the `first` measurement of the path.
-        """
+    def _average(self, cell: int, rows: Rows, measured: Array, path: MeasuredPath) -> None:
+        """Make the factor of a stretch: on a rigid path, the mean of positions is that of the mean of their levers."""
         stamp_ns, middle = path.at_middle(cell)
         there = invert(middle) @ path.odometry[rows]
         # as of one measurement: errors of GNSS last for longer than a stretch
-        covariance = np.mean([self._measurements[first + row].covariance for row in rows], axis=0) * self._scale**2
+        covariance = np.mean([self._measurements[row].covariance for row in rows], axis=0) * self._scale**2
         if self._source is Aid.GNSS:
             mean = measured[rows].mean(axis=0)
-            lever = (there[:, :3, 3] + apply(there, levers[rows])).mean(axis=0)
+            lever = (there[:, :3, 3] + apply(there, self._levers[rows])).mean(axis=0)
             noise = gtsam.noiseModel.Gaussian.Covariance(covariance + _LEAST_SIGMA_M**2 * np.eye(3))
             numbers = stamp_ns, *mean, *lever, covariance.trace()
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -36,6 +36,10 @@ from umf_ros.core.frames import State
 from umf_ros.core.geodesy import to_enu
 from umf_ros.core.geometry import Array, heading, invert, make_pose, orthonormal
 from umf_ros.core.odometry_noise import OdometryNoise
+
+if TYPE_CHECKING:  # the pose graph lies above
+    from umf_ros.pose_graph.odometry import OdometryChain
+    from umf_ros.pose_graph.sessions import Sessions
 
 # standard deviations (m, rad) of the first pose in the world: found out, as a start pose says, and fixed
 _FREE, _FIXED, _START_M, _START_RAD = 1e3, 1e-6, 5.0, np.deg2rad(5.0)
@@ -58,49 +62,6 @@ class Held(NamedTuple):
     poses: Array
     absolute: Factors
     loose: Mapping[int, gtsam.noiseModel.Base]
-
-
-class Chain(Protocol):
-    """The odometry of a session."""
-
-    @property
-    def stamps(self) -> Rows:
-        """(K,) stamps of the keyframes."""
-
-    @property
-    def travel(self) -> Array:
-        """(K,) m up to each."""
-
-    def at(self, stamps: Rows) -> NDArray[np.void]:
-        """(N,) the path at stamps."""
-
-
-class Paths(Protocol):
-    """The sessions of a pose graph; see `pose_graph.sessions.Sessions`."""
-
-    components: list[int]
-    solved: Any
-
-    @property
-    def chains(self) -> Sequence[Any]:
-        """The odometry of each session."""
-
-    @property
-    def begun(self) -> list[int]:
-        """Sessions with odometry."""
-
-    @property
-    def cost(self) -> float:
-        """Half the sum of squared errors of the last solution."""
-
-    def at(self, points: NDArray[np.void]) -> Array:
-        """(N, 4, 4) `map_T_body`."""
-
-    def find(self, stamp_ns: int) -> int | None:
-        """Session of a stamp."""
-
-    def members(self, component: int) -> list[int]:
-        """Sessions of a component."""
 
 
 @dataclass
@@ -170,7 +131,7 @@ class AbsoluteReference:
         else:
             self._refused.append(AbsoluteVerdict(*key, State.REFUSED, AbsoluteReason.UNUSABLE))
 
-    def decide(self, paths: Paths, solve: Callable[[], None], at_last: bool = False) -> None:
+    def decide(self, paths: Sessions, solve: Callable[[], None], at_last: bool = False) -> None:
         """Decide about all measurements, and `solve` the graph where the accepted ones have changed.
 
         Raises:
@@ -283,7 +244,7 @@ class AbsoluteReference:
                 held[of == component] = orthonormal(invert(self.worlds[component]) @ held[of == component])
         return held
 
-    def _place(self, paths: Paths) -> bool:
+    def _place(self, paths: Sessions) -> bool:
         """Give measurements whose odometry has arrived to their tracks; True where one is of a finished stretch."""
         waiting, placed, late = [], dict[tuple[int, Aid], list[AbsoluteMeasurement]](), False
         for one in self._waiting:
@@ -298,7 +259,7 @@ class AbsoluteReference:
             self._tracks.setdefault(key, Track(key[1], self._noise)).add(new)
         return late
 
-    def _judge(self, paths: Paths, at_last: bool) -> bool:
+    def _judge(self, paths: Sessions, at_last: bool) -> bool:
         """Decide about the tracks; returns whether what is accepted has changed."""
         changed = False
         # gravity before GNSS: both say how the map lies in the world, and GNSS says more
@@ -318,13 +279,13 @@ class AbsoluteReference:
                 path = MeasuredPath(
                     path.odometry, self.worlds[component] @ path.poses, path.travel, path.finished, path.at_middle
                 )
-            track.judge(measured, path, known, at_last)
+            track.judge(measured, path, known)
             if track.factors and not known:
                 self.worlds[component] = _upright(apply(path.poses, measured).mean(axis=0))
             changed = changed or before != {cell: factor.numbers for cell, factor in track.held.items()}
         return changed
 
-    def _path(self, track: Track, session: int, paths: Paths, at_last: bool) -> MeasuredPath:
+    def _path(self, track: Track, session: int, paths: Sessions, at_last: bool) -> MeasuredPath:
         chain = paths.chains[session]
         points = chain.at(track.stamps)
 
@@ -350,13 +311,13 @@ class AbsoluteReference:
         if settings.elevation_model and self._model is None:
             self._model = load_elevation(Path(settings.elevation_model), settings.elevation_sigma_m, self.origin)
 
-    def _has_gnss(self, component: int, paths: Paths) -> bool:
+    def _has_gnss(self, component: int, paths: Sessions) -> bool:
         """Whether accepted fixes hold a component in the world."""
         tracks = ((session, track) for (session, source), track in self._tracks.items() if source is Aid.GNSS)
         return any(bool(track.factors) and paths.components[session] == component for session, track in tracks)
 
     def _judge_heights(
-        self, model: ElevationModel, component: int, paths: Paths, solve: Callable[[], None], at_last: bool
+        self, model: ElevationModel, component: int, paths: Sessions, solve: Callable[[], None], at_last: bool
     ) -> None:
         """Test now and then whether an elevation model fits the path; its heights are in the map where it does."""
         if component not in self._heights and not self._has_gnss(component, paths):
@@ -377,7 +338,7 @@ class AbsoluteReference:
             solve()
             self._fitting(model, component, paths)
 
-    def _test(self, model: ElevationModel, component: int, paths: Paths, solve: Callable[[], None]) -> None:
+    def _test(self, model: ElevationModel, component: int, paths: Sessions, solve: Callable[[], None]) -> None:
         """Solve with the heights, and take that back where they do not fit, or fit elsewhere as well.
 
         The first time, the model is tried at other places too: heights that fit there say nothing.
@@ -399,7 +360,7 @@ class AbsoluteReference:
             solve()
 
     def _try(
-        self, model: ElevationModel, component: int, paths: Paths, solve: Callable[[], None], cost: float
+        self, model: ElevationModel, component: int, paths: Sessions, solve: Callable[[], None], cost: float
     ) -> tuple[float, float]:
         """Solve with the heights of a model; returns what each costs, and the share of them that fit."""
         heights, given = self._heights[component], self._model
@@ -412,7 +373,7 @@ class AbsoluteReference:
         finally:
             heights.fits, self._rounds, self._model = False, _ROUNDS, given
 
-    def _fitting(self, model: ElevationModel, component: int, paths: Paths) -> float:
+    def _fitting(self, model: ElevationModel, component: int, paths: Sessions) -> float:
         """Measure all heights against the map; returns the share that fit, 0 where the model covers less than half."""
         heights, poses = self._heights[component], list[Array]()
         keys = sorted(heights.misfits)
@@ -431,7 +392,7 @@ class AbsoluteReference:
         planes = self._model.planes(poses[rows], is_free, gate)
         return [(row, make) for row, make in zip(rows, planes, strict=True) if make is not None]
 
-    def _begin_at(self, start: Array, model: ElevationModel, component: int, paths: Paths) -> None:
+    def _begin_at(self, start: Array, model: ElevationModel, component: int, paths: Sessions) -> None:
         """Say how a component lies in the world by x, y and heading of its first pose; gravity may have levelled it."""
         chain = paths.chains[component]
         first = paths.at(chain.at(chain.stamps[:1]))[0]
@@ -454,13 +415,13 @@ def _attached(track: Track, session: int, points: NDArray[np.void]) -> Factors:
     ]
 
 
-def _finished(chain: Chain) -> tuple[int, int]:
+def _finished(chain: OdometryChain) -> tuple[int, int]:
     """Number of the finished stretches of a session, and the stamp at the end of the last."""
     cell = int(chain.travel[-1] // STRETCH_M)
     return cell, int(chain.stamps[np.searchsorted(chain.travel, cell * STRETCH_M)])
 
 
-def _middle(chain: Chain, cell: int) -> Rows:
+def _middle(chain: OdometryChain, cell: int) -> Rows:
     """(1,) stamp of the keyframe in the middle of a stretch."""
     row = min(int(np.searchsorted(chain.travel, (cell + 0.5) * STRETCH_M)), len(chain.travel) - 1)
     return chain.stamps[row : row + 1]
