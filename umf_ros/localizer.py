@@ -260,27 +260,31 @@ _STATES = {
 
 
 class MapFollower(PoseGraph):
-    """Localisation in a map with the interface of a pose graph; closures are counted by state and not kept."""
+    """Localisation in a map with the interface of a pose graph; closures are counted by state and not kept.
+
+    Attributes:
+        localizer: the hypotheses of the pose.
+    """
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings.pose_graph)
-        self._localizer = Localizer(read_poses(Path(settings.map)), settings.pose_graph)
+        self.localizer = Localizer(read_poses(Path(settings.map)), settings.pose_graph)
         self._poses: list[Localization] = []
         self._states: Counter[State] = Counter()
 
     @property
     def probability(self) -> float:
         """Probability of the pose; 0 while it is unknown."""
-        found = self._localizer.estimate()
+        found = self.localizer.estimate()
         return 0.0 if found is None else found.probability
 
     def begin_session(self) -> None:
         """Delete the pose: the rover may be anywhere."""
-        self._localizer.begin_session()
+        self.localizer.begin_session()
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
         """Add an odometry message; return whether it was usable."""
-        usable, found = self._localizer.add_odometry(stamp_ns, odom_T_body), self._localizer.estimate()
+        usable, found = self.localizer.add_odometry(stamp_ns, odom_T_body), self.localizer.estimate()
         if found is not None:
             last = self._poses[-1].map_T_body[:3, 3] if self._poses else np.full(3, np.inf)
             if np.linalg.norm(found.map_T_body[:3, 3] - last) >= _SPACING_M:
@@ -293,20 +297,20 @@ class MapFollower(PoseGraph):
 
     def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
         """Add a closure with the map; return its verdict."""
-        before = Counter(self._localizer.counts)
-        self._localizer.add_closure(closure)
-        change = Counter(self._localizer.counts) - before
+        before = Counter(self.localizer.counts)
+        self.localizer.add_closure(closure)
+        change = Counter(self.localizer.counts) - before
         state, reason = _STATES.get(next(iter(change), ""), (State.PENDING, ClosureReason.NO_ODOMETRY_YET))
         self._states[state] += 1
         return [ClosureVerdict(closure, state, reason)]
 
     def map_T_odom(self) -> Array | None:
         """Return (4, 4) pose of the odometry frame in the map; None while it is unknown."""
-        return self._localizer.map_T_odom()
+        return self.localizer.map_T_odom()
 
     def covariance(self) -> Array:
         """Return (6, 6) of the newest pose in ROS order; zero while it is unknown."""
-        found = self._localizer.estimate()
+        found = self.localizer.estimate()
         return np.zeros((6, 6)) if found is None else found.covariance
 
     def trajectory(self, optimized: bool = True) -> tuple[NDArray[np.int64], Array]:

@@ -9,16 +9,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.bags.sensor_check import SensorCheck
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
-from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector
-from umf_ros.localizer import Localization, Localizer, read_poses
+from umf_ros.localizer import Localization, Localizer, MapFollower
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.runs.writer import RunRecorder, write_summary
 from umf_ros.sensors.decode import OdometrySample
@@ -37,7 +34,7 @@ class Replay:
     """Replay: feeds frames to the detector, odometry and closures to the pose graph, and writes a run folder.
 
     The graph gets the inputs of the live back-end: every odometry message, and one closure after the other. With
-    settings of mode localization, a localizer in the map takes the place of the graph.
+    settings of mode localization, a `MapFollower` takes the place of the graph, as live.
 
     Args:
         folder: run folder.
@@ -59,19 +56,17 @@ class Replay:
     def __init__(self, folder: Path, settings: Settings, detector: LoopDetector, resume: bool = False) -> None:
         self._folder = folder
         self._detector = detector
-        self._localizer: Localizer | None = None
-        if settings.localizing:
-            self._localizer = Localizer(read_poses(Path(settings.map)), settings.pose_graph)
-        self._graph = PoseGraph(settings.pose_graph)
+        self._graph = MapFollower(settings) if settings.localizing else PoseGraph(settings.pose_graph)
+        self._localizer = self._graph.localizer if isinstance(self._graph, MapFollower) else None
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
-        self._feed = OdometrySessionSplitter(self._localizer or self._graph)
+        self._feed = OdometrySessionSplitter(self._graph)
         self.sensor_check = SensorCheck()
         self._checking = ThreadPoolExecutor(1, "sensor-check")  # OpenCV and small_gicp release the interpreter lock
         self._unchecked: deque[Future[None]] = deque()
         self.faults = 0
         self.counts: dict[str, Any] = {"keyframes": 0, "keyframes_until_found": None, "located": 0}
         self.counts |= {"relocalised": 0, "agreed": 0, "contradicted": 0}
-        self._found: list[Localization] = []
+        self._newest_ns = -1
         self._has_odometry = False
         self._done = len(self._recorder.recorded) if resume else 0
         self._earlier: dict[int, list[LoopClosure]] = defaultdict(list)
@@ -94,9 +89,8 @@ class Replay:
                 continue
             if isinstance(item, AbsoluteMeasurement):
                 self._recorder.record_absolute(item)
-                if self._localizer is None:
-                    self._graph.add_absolute(item)
-                    self._graph.update()
+                self._graph.add_absolute(item)
+                self._graph.update()
                 continue
             self._check_sensors(item)
             if self._done > WARM_UP:
@@ -134,7 +128,7 @@ class Replay:
 
     def _add_closures(self, closures: Iterable[LoopClosure]) -> None:
         for closure in closures:
-            (self._localizer or self._graph).add_closure(closure)
+            self._graph.add_closure(closure)
 
     def raise_if_frames_failed(self) -> None:
         """Report skipped frames, once everything else is written.
@@ -148,9 +142,6 @@ class Replay:
 
     def graph_counts(self) -> dict[str, int]:
         """Return the number of closures by state so far; none without odometry."""
-        if self._localizer is not None:
-            counts = self._localizer.counts
-            return {"accepted": counts["agreed"], "rejected": counts["contradicted"], "pending": counts["searching"]}
         verdicts = self._graph.verdict_counts() if self._has_odometry else {}
         return {state.value: count for state, count in verdicts.items()}
 
@@ -177,8 +168,8 @@ class Replay:
             return
         counts["located"] += 1
         counts["keyframes_until_found"] = counts["keyframes_until_found"] or counts["keyframes"]
-        if not self._found or found.stamp_ns > self._found[-1].stamp_ns:  # else the clock was set back
-            self._found.append(found)
+        if found.stamp_ns > self._newest_ns:  # else the clock was set back
+            self._newest_ns = found.stamp_ns
             self._recorder.record_pose(*found)
 
     def finish(self, drops: Mapping[str, int]) -> bool:
@@ -193,9 +184,8 @@ class Replay:
         if self._detector.inter_robot is not None:
             for inter_closure in self._detector.inter_robot.finish(FLEET_PATIENCE_S):
                 self._recorder.record_inter_robot(inter_closure)
-        if self._localizer is not None:
-            has_trajectory = self._write_localization()
-        elif has_trajectory := self._has_odometry:
+        has_trajectory = self._has_odometry if self._localizer is None else bool(self.counts["located"])
+        if has_trajectory:
             self._graph.write_results(self._folder)
         known = {} if self._localizer is None else {"localization": self.counts}
         write_summary(self._folder, self._recorder.summary(drops) | known)
@@ -203,10 +193,3 @@ class Replay:
         self._detector.close()
         self._checking.shutdown()
         return has_trajectory
-
-    def _write_localization(self) -> bool:
-        if self._found:
-            stamps = np.array([one.stamp_ns for one in self._found], np.int64)
-            poses = np.stack([one.map_T_body for one in self._found])
-            write_tum(self._folder / "trajectory_in_map.tum", Trajectory(stamps, poses))
-        return bool(self._found)
