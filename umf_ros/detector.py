@@ -20,9 +20,8 @@ from umf_ros.core.config import KeyframePolicy, Settings
 from umf_ros.core.errors import ConfigError, OutputError, UmfError
 from umf_ros.core.frames import Candidate, Embedding, Frame, Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, relative, rotation_angle
-from umf_ros.embedding import make_embedder
+from umf_ros.embedding import Embedder, make_embedder
 from umf_ros.embedding.depth import lift
-from umf_ros.embedding.embedder import Embedder
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
 from umf_ros.verification import Hypothesis, RejectReason, Verifier, thin_frame

@@ -39,8 +39,7 @@ from umf_ros.core.frames import Frame, Keyframe, LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import LoopDetector, make_detector_embedder
-from umf_ros.embedding import make_embedder
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder, make_embedder
 from umf_ros.lab.evaluation.worlds import FULL, QUICK, TestWorld
 from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.runs.truth import find_revisits, judge_closure

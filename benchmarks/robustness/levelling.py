@@ -22,8 +22,7 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.geometry import Array, make_pose, rotation_angle
 from umf_ros.core.levelling import level
-from umf_ros.embedding import make_embedder
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder, make_embedder
 from umf_ros.lab.scan_files import make_snapshot
 from umf_ros.lab.simulation.domains import DOMAINS, survey
 from umf_ros.lab.simulation.domains.scanners import SCANNERS, Sweep, sweep

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from umf_ros.core.frames import Frame
 from umf_ros.core.resources import find
-from umf_ros.embedding.embedder import FeatureRequest
+from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.runtimes import MODEL_SUFFIX, Arrays, OpenVinoRuntime, outputs_of
 from umf_ros.lab.datasets.views import read_frame
 from umf_ros.lab.fit.quantisation import export_model, image_input, rendered_frames, save_model

@@ -13,8 +13,7 @@ from umf_ros.absolute.measurement import (
     parse_numbers,
 )
 from umf_ros.core.errors import ConfigError, MessageError
-from umf_ros.core.geodesy import from_enu, to_enu
-from umf_ros.core.geometry import from_quaternion, make_pose
+from umf_ros.core.geometry import from_enu, from_quaternion, make_pose, to_enu
 
 ORIGIN = np.array([37.72, 15.0, 2550.0])
 TURNED = from_quaternion((0, 0, 0), (0, 0, np.sin(np.pi / 4), np.cos(np.pi / 4)))

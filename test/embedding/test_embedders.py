@@ -20,8 +20,7 @@ from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, WeightsError, either
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import transform
-from umf_ros.embedding import make_embedder
-from umf_ros.embedding.embedder import FeatureRequest
+from umf_ros.embedding import FeatureRequest, make_embedder
 from umf_ros.embedding.umf import UmfEmbedder
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF

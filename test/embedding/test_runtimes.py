@@ -16,7 +16,7 @@ from tiny_worlds import TINY, some_scan
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, WeightsError
 from umf_ros.core.resources import find
-from umf_ros.embedding.embedder import FeatureRequest
+from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.inputs import pack, prepare_scan
 from umf_ros.embedding.runtimes import (
     OUTPUTS,

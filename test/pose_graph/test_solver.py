@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from umf_ros.core.errors import GraphError
-from umf_ros.core.g2o import EDGE
 from umf_ros.core.geometry import Array, expmap, invert, make_pose, relative
+from umf_ros.core.trajectory import EDGE
 from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops
 from umf_ros.pose_graph.solver import Graph, GraphSolver
 

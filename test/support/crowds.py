@@ -10,7 +10,7 @@ from umf_ros.core.config import Settings
 from umf_ros.core.frames import Candidate, Frame, Keyframe
 from umf_ros.core.geometry import Array
 from umf_ros.detector import LoopDetector
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder
 
 PLACES = (0, 1_000, 10_000, 100_000)
 

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.errors import ConfigError, one_line
-from umf_ros.core.geodesy import from_enu
-from umf_ros.core.geometry import Array
+from umf_ros.core.geometry import Array, from_enu
 
 _HUBER = 1.345
 # by hand: along the ground a height says nothing; between the middles of cells a slope is known to a quarter of one

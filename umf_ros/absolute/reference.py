@@ -33,8 +33,7 @@ from umf_ros.absolute.measurement import (
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError
 from umf_ros.core.frames import State
-from umf_ros.core.geodesy import to_enu
-from umf_ros.core.geometry import Array, heading, invert, make_pose, orthonormal
+from umf_ros.core.geometry import Array, heading, invert, make_pose, orthonormal, to_enu
 from umf_ros.core.odometry_noise import OdometryNoise
 
 if TYPE_CHECKING:  # the pose graph lies above

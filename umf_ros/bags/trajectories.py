@@ -14,7 +14,7 @@ from umf_ros.bags.reader import Bag, decode
 from umf_ros.bags.storages import RawMessage
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import BagError, MessageError
-from umf_ros.core.geodesy import to_enu
+from umf_ros.core.geometry import to_enu
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose, stamp_ns

@@ -17,7 +17,7 @@ from umf_ros.baselines.place_networks import locate_place_weights
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import OutputError, WeightsError
 from umf_ros.core.frames import Embedding, Frame, Image, Points
-from umf_ros.embedding.embedder import FeatureRequest
+from umf_ros.embedding import FeatureRequest
 
 Binary = NDArray[np.uint8]
 """(N, 32) descriptors of 256 bits."""

@@ -9,7 +9,7 @@ from umf_ros.baselines import unit_descriptor
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.frames import Embedding, Frame, Image, Points
 from umf_ros.core.geometry import Array, invert, transform
-from umf_ros.embedding.embedder import Embedder, FeatureRequest
+from umf_ros.embedding import Embedder, FeatureRequest
 from umf_ros.embedding.inputs import shrink
 
 HEIGHT, WIDTH, CELL, BINS = 96, 128, 16, 9

@@ -14,7 +14,7 @@ from umf_ros.baselines.place_network import IMAGE_SIZE, LATE, Gem, ImageTrunk
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, WeightsError, one_line
 from umf_ros.core.frames import Embedding, Frame, Image, Points
-from umf_ros.embedding.embedder import FeatureRequest
+from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.inputs import is_blank, shrink, standardise
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.efficientnet import STAGES, EfficientNetLite0

@@ -17,7 +17,7 @@ from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, UmfError, WeightsError, either
 from umf_ros.core.frames import Embedding, Frame
 from umf_ros.core.resources import find
-from umf_ros.embedding.embedder import FeatureRequest
+from umf_ros.embedding import FeatureRequest
 from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import fill, read_weights
 

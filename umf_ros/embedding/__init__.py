@@ -9,13 +9,13 @@ from __future__ import annotations
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from umf_ros.core.errors import ConfigError, either
 
 if TYPE_CHECKING:
     from umf_ros.core.config import EmbeddingSettings
-    from umf_ros.embedding.embedder import Embedder
+    from umf_ros.core.frames import Embedding, Frame
 
 GROUP = "umf_ros.embedders"
 DEFAULT = "umf"
@@ -29,6 +29,29 @@ _MODULES = {
     **dict.fromkeys(("minkloc_visual", "minkloc_lidar", "minkloc_fusion"), "umf_ros.baselines.place_networks"),
 }
 """Modules of the methods that come with the package, each with a function `make`."""
+
+
+class FeatureRequest(NamedTuple):
+    """Requested local features; others are not computed.
+
+    Attributes:
+        image: local features of the image.
+        supers: super-features.
+    """
+
+    image: bool = True
+    supers: bool = False
+
+
+class Embedder(Protocol):
+    """Protocol of a method that turns a frame into a global descriptor and local features."""
+
+    name: str
+    dimension: int
+
+    def embed(self, frame: Frame) -> Embedding:
+        """Embed one frame; either modality may be missing. Deterministic for one thread count."""
+        ...
 
 
 @cache
@@ -58,8 +81,6 @@ def make_embedder(settings: EmbeddingSettings, super_features: bool = False, fea
     method = settings.method
     if method not in find_methods():
         raise ConfigError(f"embedding.method: unknown method {method!r}; known: {', '.join(find_methods())}")
-    from umf_ros.embedding.embedder import FeatureRequest
-
     asked = FeatureRequest(image=features == OWN_FEATURES, supers=super_features)
     if method in _MODULES:
         make = import_module(_MODULES[method]).make

@@ -13,8 +13,8 @@ from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.frames import Embedding, Frame, Image, LocalFeatures, Points
 from umf_ros.core.geometry import Array
 from umf_ros.core.resources import find
+from umf_ros.embedding import Embedder
 from umf_ros.embedding.depth import lift_features
-from umf_ros.embedding.embedder import Embedder
 from umf_ros.embedding.inputs import is_blank
 from umf_ros.embedding.runtimes import make_runtime, name_outputs
 from umf_ros.networks.config import XFEAT_CELL, XFEAT_OUTPUTS, XFEAT_STRIDE

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, WeightsError, one_line
-from umf_ros.embedding.embedder import FeatureRequest
+from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.inputs import blank_input
 from umf_ros.networks.config import XFEAT_OUTPUTS, read_config
 

@@ -11,7 +11,7 @@ from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.frames import Embedding, Frame, LocalFeatures, Points, SuperFeatures
 from umf_ros.core.geometry import Array, invert, transform
 from umf_ros.core.levelling import level
-from umf_ros.embedding.embedder import FeatureRequest
+from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.inputs import VoxelScan, is_blank, pack, prepare_image, prepare_scan
 from umf_ros.embedding.runtimes import Outputs, make_runtime, name_outputs, outputs_of
 from umf_ros.networks.config import locate_weights, read_config

@@ -17,9 +17,8 @@ from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError, writing
 from umf_ros.core.frames import LoopClosure
-from umf_ros.core.g2o import write_g2o
 from umf_ros.core.geometry import Array, gtsam_to_ros_covariance, invert
-from umf_ros.core.trajectory import Trajectory, write_tum
+from umf_ros.core.trajectory import Trajectory, write_g2o, write_tum
 from umf_ros.pose_graph.closures import (
     ClosureReason,
     ClosureVerdict,

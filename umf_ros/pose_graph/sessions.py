@@ -11,8 +11,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import PoseGraphSettings
-from umf_ros.core.g2o import EDGE
 from umf_ros.core.geometry import Array, adjoint, invert, propagate
+from umf_ros.core.trajectory import EDGE
 from umf_ros.pose_graph.closures import Closures
 from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.odometry import POINT, CorrectedPath, OdometryChain, PathPoints, Rows, Stamps, noise_between

@@ -10,8 +10,8 @@ from graph_worlds import closing, lap_pairs, two_laps
 from typer.testing import CliRunner, Result
 
 from umf_ros.core.errors import GraphError, OutputError, UmfError
-from umf_ros.core.g2o import write_g2o
 from umf_ros.core.geometry import relative
+from umf_ros.core.trajectory import write_g2o
 from umf_ros.lab.commands.graph import MOST_ROWS, app
 from umf_ros.lab.datasets.g2o import read_g2o
 from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops, with_wrong_closures

@@ -11,7 +11,7 @@ from tiny_worlds import TINY
 
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.frames import Frame
-from umf_ros.embedding.embedder import FeatureRequest
+from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.umf import UmfEmbedder
 from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures, tsne
 from umf_ros.lab.training.networks import save_weights

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.trajectories import read_rtklib
-from umf_ros.core.geodesy import to_enu
-from umf_ros.core.geometry import heading, make_pose, relative
+from umf_ros.core.geometry import heading, make_pose, relative, to_enu
 from umf_ros.lab.simulation import motion_sensors
 from umf_ros.lab.simulation.motion_sensors import Drift, Motion, drifting
 from umf_ros.lab.simulation.route import Route

@@ -37,7 +37,7 @@ def command(
 
     from umf_ros.core.errors import ConfigError, WeightsError
     from umf_ros.core.io import check_writable
-    from umf_ros.embedding.embedder import FeatureRequest
+    from umf_ros.embedding import FeatureRequest
     from umf_ros.embedding.runtimes import MODEL_SUFFIX, outputs_of
     from umf_ros.networks.config import locate_weights
 

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError, writing
 from umf_ros.core.frames import LoopClosure
-from umf_ros.core.g2o import EDGE, g2o_lines, write_g2o
 from umf_ros.core.geometry import (
     Array,
     adjoint,
@@ -31,6 +30,7 @@ from umf_ros.core.geometry import (
     make_pose,
     propagate,
 )
+from umf_ros.core.trajectory import EDGE, g2o_lines, write_g2o
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import check_covariance, verdict_table
 from umf_ros.pose_graph.solver import Edge

@@ -21,8 +21,7 @@ from umf_ros.bags.trajectories import read_ground_truth, read_odometry
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import BagError, UmfError, one_line
 from umf_ros.core.frames import Frame, Image
-from umf_ros.core.geodesy import to_enu
-from umf_ros.core.geometry import Array, align, transform
+from umf_ros.core.geometry import Array, align, to_enu, transform
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.embedding.inputs import shrink
 from umf_ros.lab.datasets.sample import Sample

@@ -15,7 +15,7 @@ from umf_ros.core.frames import Frame, Keyframe, ScanMotion
 from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import LoopDetector
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder
 from umf_ros.lab.datasets.s3li import ETNA_TEST
 from umf_ros.lab.datasets.sample import Rule, SampleSequence
 from umf_ros.lab.evaluation.methods_run import FrameSet

@@ -21,7 +21,7 @@ from umf_ros.core.errors import BagError, ConfigError, SensorFileError, UmfError
 from umf_ros.core.frames import Candidate, Frame, Image, Keyframe, LoopClosure, Points
 from umf_ros.core.geometry import transform
 from umf_ros.detector import make_keyframe
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder
 from umf_ros.lab.scan_files import OUT_OF_REACH, UNCALIBRATED, fit_image, make_snapshot, read_image, read_scan
 from umf_ros.runs.run_file import pose_numbers
 from umf_ros.sensors.calibration import load_calibration

@@ -12,8 +12,7 @@ import numpy as np
 from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.core.frames import Frame, Keyframe, LocalFeatures, SuperFeatures
-from umf_ros.embedding import DEFAULT, find_methods, make_embedder
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import DEFAULT, Embedder, find_methods, make_embedder
 from umf_ros.lab.evaluation.methods import (
     MethodAnswers,
     MethodCost,

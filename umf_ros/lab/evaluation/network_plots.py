@@ -21,7 +21,7 @@ from torch import Tensor
 from umf_ros.core.frames import Embedding, Frame, Image, Points
 from umf_ros.core.geometry import Array, transform
 from umf_ros.core.levelling import level
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder
 from umf_ros.embedding.inputs import prepare_scan
 from umf_ros.embedding.torch_runtimes import to_tensors
 from umf_ros.lab.datasets.views import read_frame

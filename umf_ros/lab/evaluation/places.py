@@ -16,8 +16,7 @@ from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.core.frames import Frame, Image, Points, StereoCamera
 from umf_ros.core.geometry import transform
 from umf_ros.core.io import read_yaml
-from umf_ros.embedding import make_embedder
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder, make_embedder
 from umf_ros.lab.evaluation.results import EvaluationReport, Figures, Scores, TextTable, percent, rounded, score
 from umf_ros.lab.evaluation.retrieval import Mask, PlaceCollection, RetrievalTask, rank, rerank_all
 from umf_ros.lab.scan_files import SUFFIXES, read_scan

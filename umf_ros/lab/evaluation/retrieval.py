@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from umf_ros.core.config import Loop, Verification
 from umf_ros.core.frames import Candidate, Embedding, Frame, Keyframe
 from umf_ros.core.geometry import Array
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder
 from umf_ros.lab.datasets.sample import Rule, distances, label, places_of
 from umf_ros.places.database import is_past
 from umf_ros.verification.rerank import rerank

@@ -14,7 +14,7 @@ import numpy as np
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder
 from umf_ros.embedding.umf import UmfEmbedder
 from umf_ros.lab.evaluation.results import Figures, Scores, TextTable, YawBin, mean, percent, rounded, scores_table
 from umf_ros.lab.evaluation.retrieval import METHODS, RERANKERS, TOP_K, Indices

@@ -12,8 +12,7 @@ import numpy as np
 from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Frame, ScanMotion
 from umf_ros.core.geometry import Array
-from umf_ros.embedding import make_embedder
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder, make_embedder
 from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures
 from umf_ros.lab.evaluation.results import (
     EvaluationReport,

@@ -28,7 +28,7 @@ from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Candidate, Frame, Keyframe
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import write_atomically
-from umf_ros.embedding.embedder import FeatureRequest
+from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.local_features import WithXFeat
 from umf_ros.embedding.umf import make
 from umf_ros.lab.evaluation.places import PlaceSet, read_place_sets, read_set

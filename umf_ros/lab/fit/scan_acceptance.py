@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, invert, make_pose, relative, rotation_angle, transform
-from umf_ros.embedding import make_embedder
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder, make_embedder
 from umf_ros.lab.fit.acceptance import (
     EXAMPLES,
     Example,

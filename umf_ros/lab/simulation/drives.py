@@ -17,7 +17,7 @@ from umf_ros.core.frames import Frame, Image, Keyframe, ScanMotion, StereoCamera
 from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle, transform
 from umf_ros.core.io import atomic_write
 from umf_ros.detector import make_keyframe
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, resized
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.route import SETTINGS, plan_passes

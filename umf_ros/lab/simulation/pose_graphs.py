@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.frames import LoopClosure
-from umf_ros.core.geodesy import from_enu
-from umf_ros.core.geometry import Array, expmap, gtsam_to_ros_covariance, invert, orthonormal, relative
+from umf_ros.core.geometry import Array, expmap, from_enu, gtsam_to_ros_covariance, invert, orthonormal, relative
 
 Kind = Literal["random", "groups", "near"]
 PERIOD_NS = 1_000_000_000

@@ -15,7 +15,7 @@ from umf_ros.core.frames import Candidate, Embedding, Keyframe, LoopClosure, Sca
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.core.io import atomic_write
 from umf_ros.detector import make_keyframe
-from umf_ros.embedding.embedder import Embedder
+from umf_ros.embedding import Embedder
 from umf_ros.lab.scan_files import UNCALIBRATED, make_snapshot
 from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
 from umf_ros.lab.simulation.domains.passages import Passage
