@@ -10,7 +10,6 @@ import numpy as np
 from umf_ros.core.frames import StereoCamera
 from umf_ros.core.geometry import make_pose
 from umf_ros.embedding.inputs import pack, prepare_scan
-from umf_ros.embedding.torch_runtimes import to_tensors
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.datasets.views import View, ViewMaker
 from umf_ros.networks.config import NetworkConfig
@@ -49,7 +48,7 @@ def some_input(config: NetworkConfig = TINY, count: int = 2, trim: bool = False)
     rng = np.random.default_rng(5)
     images = [rng.normal(size=config.image_size).astype(np.float32) for _ in range(count)]
     scans = [prepare_scan(some_scan(seed), None, config) for seed in range(count)]
-    return to_tensors(pack(images, scans, config, trim))
+    return NetworkInput.of(pack(images, scans, config, trim))
 
 
 def pose_at(x: float, y: float, yaw_deg: float = 0.0) -> np.ndarray:

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.errors import ConfigError, one_line
+from umf_ros.core.errors import ConfigError, reading
 from umf_ros.core.geometry import Array, from_enu
 
 _HUBER = 1.345
@@ -105,17 +105,13 @@ def load_elevation(path: Path, sigma_m: float, origin: Array | None) -> Elevatio
     Raises:
         ConfigError: the file cannot be read, or rasterio is not installed.
     """
-    try:
+    with reading(f"elevation model {path}", ConfigError, "cannot be read"):
         if path.suffix == ".npz":
             heights, to_pixel = _read_arrays(path)
         elif path.suffix == ".asc":
             heights, to_pixel = _read_ascii(path)
         else:
             heights, to_pixel = _read_geotiff(path, origin)
-    except ConfigError:
-        raise
-    except Exception as error:  # readers of files from anywhere raise anything
-        raise ConfigError(f"elevation model {path} cannot be read: {one_line(error)}") from None
     if heights.ndim != 2 or min(heights.shape) < 2 or not np.isfinite(to_pixel).all():
         raise ConfigError(f"elevation model {path} is no grid of heights")
     cell_m = float(1 / np.sqrt(abs(np.linalg.det(to_pixel[:, :2]))))

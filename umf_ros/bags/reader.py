@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from umf_ros.bags.storages import RawMessage, RecordedFile, TopicInfo, message_types, open_files
-from umf_ros.core.errors import BagError, MessageError, one_line, shortened
+from umf_ros.core.errors import BagError, MessageError, one_line, reading
 
 
 class Bag:
@@ -46,7 +45,7 @@ class Bag:
             BagError: the recording is damaged.
         """
         wanted = self.topics.keys() if topics is None else self.topics.keys() & set(topics)
-        with _one_line(self.path):
+        with reading(self.path, BagError, "cannot be read"):
             for file in self._files:
                 yield from file.messages(wanted)
 
@@ -76,19 +75,6 @@ def decode(raw: RawMessage) -> Any:
         raise MessageError("undecodable", f"message does not match its type {raw.type} ({cause})") from None
 
 
-@contextmanager
-def _one_line(path: Path) -> Iterator[None]:
-    """Report any fault of reading a recording as a `BagError`."""
-    try:
-        yield
-    except BagError:
-        raise
-    except OSError as error:
-        raise BagError(f"cannot read {shortened(path)}: {error.strerror or error}") from None
-    except Exception as error:  # damaged bytes raise any exception
-        raise BagError(f"{shortened(path)} cannot be read: {one_line(error)}") from None
-
-
 def open_bag(path: str | Path) -> Bag:
     """Open an mcap file, a ROS 2 folder (mcap or db3), a db3 file or a ROS 1 `.bag`.
 
@@ -98,7 +84,7 @@ def open_bag(path: str | Path) -> Bag:
         BagError: there is no such recording, it is another kind of file, or it holds no message.
     """
     path = Path(path)
-    with _one_line(path):
+    with reading(path, BagError, "cannot be read"):
         if not path.exists():
             raise BagError(f"there is no recording {path}")
         bag = Bag(path, open_files(path))

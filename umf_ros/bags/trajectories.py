@@ -13,7 +13,7 @@ from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.reader import Bag, decode
 from umf_ros.bags.storages import RawMessage
 from umf_ros.core.config import Settings
-from umf_ros.core.errors import BagError, MessageError
+from umf_ros.core.errors import BagError, MessageError, reading
 from umf_ros.core.geometry import to_enu
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import calibration_of
@@ -155,9 +155,5 @@ def read_lines(path: str | Path) -> list[str]:
     Raises:
         BagError: the file cannot be read or is not text.
     """
-    try:
+    with reading(path, BagError, "is not a text file"):
         return Path(path).read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise BagError(f"cannot read {path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise BagError(f"{path} is not a text file") from None

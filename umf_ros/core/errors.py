@@ -70,6 +70,22 @@ def writing(what: object, *kinds: type[Exception]) -> Iterator[None]:
         raise OutputError(f"cannot write {what}: {getattr(error, 'strerror', None) or error}") from None
 
 
+@contextmanager
+def reading(path: object, kind: type[UmfError], fault: str) -> Iterator[None]:
+    """Raise anything that the block raises as one line of a `kind` of error; those of the package pass.
+
+    `fault` is said of a file that can be opened: damaged bytes raise any exception in the libraries that read them.
+    """
+    try:
+        yield
+    except UmfError:
+        raise
+    except OSError as error:
+        raise kind(f"cannot read {shortened(path)}: {error.strerror or one_line(error)}") from None
+    except Exception as error:
+        raise kind(f"{shortened(path)} {fault}: {one_line(error)}") from None
+
+
 def either(names: Sequence[str]) -> str:
     """Return the names as a choice, "a, b or c": for messages and help."""
     return " or ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)

@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, shortened, writing
+from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, reading, shortened, writing
 
 Check = Callable[[sqlite3.Connection], None]
 _DAMAGE = (sqlite3.Error, ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
@@ -302,19 +302,13 @@ def read_yaml(path: Path) -> Any:
     Raises:
         ConfigError: the file cannot be read.
     """
-    try:
+    with reading(path, ConfigError, "is not valid YAML"):
         with path.open(encoding="utf-8") as file:  # it may be a pipe, whose size is unknown
             text = file.read(LARGEST_YAML + 1)
         if len(text) > LARGEST_YAML:
-            raise ConfigError(f"{path} is not valid YAML: larger than {LARGEST_YAML >> 20} MB")
+            raise ValueError(f"larger than {LARGEST_YAML >> 20} MB")
         _count_nodes(yaml.compose(text, yaml.SafeLoader), {})
         return yaml.safe_load(text)
-    except ConfigError:
-        raise
-    except OSError as error:
-        raise ConfigError(f"cannot read {shortened(path)}: {error.strerror}") from None
-    except Exception as error:  # the library raises anything on a tag that its value does not fit
-        raise ConfigError(f"{shortened(path)} is not valid YAML: {one_line(error)}") from None
 
 
 def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:

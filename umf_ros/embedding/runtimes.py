@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.config import EmbeddingSettings
-from umf_ros.core.errors import ConfigError, WeightsError, one_line
+from umf_ros.core.errors import ConfigError, WeightsError, reading
 from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.inputs import blank_input
 from umf_ros.networks.config import XFEAT_OUTPUTS, read_config
@@ -66,12 +66,10 @@ class OpenVinoRuntime:
 
     def __init__(self, weights: Path, outputs: tuple[str, ...], threads: int) -> None:
         path = weights.with_suffix(MODEL_SUFFIX)
-        try:
+        with reading(path, WeightsError, "is damaged"):
             with zipfile.ZipFile(path) as archive:
                 model = openvino_core().read_model(archive.read("model.xml"), archive.read("model.bin"))
             self.precision, made_from = (model.get_rt_info([FACTS, name]).value for name in ("precision", "weights"))
-        except Exception as error:  # a damaged file raises any exception
-            raise WeightsError(f"{path} is damaged: {one_line(error)}") from None
         if made_from != hashlib.sha256(weights.read_bytes()).hexdigest():
             raise WeightsError(f"{path} was made from other weights; delete it, or make it again with umf export")
         for result in model.get_results():
@@ -87,6 +85,47 @@ class OpenVinoRuntime:
         """Return the outputs of a batch of one; see `Runtime`."""
         found = self._model(list(inputs))
         return {port.any_name: found[port][0].astype(np.float32) for port in self._model.outputs}
+
+
+class TorchRuntime:
+    """Torch in single precision, imported when it is used.
+
+    Args:
+        weights: file of the UMF network, or for `XFEAT_OUTPUTS` of XFeat.
+        outputs: names of the outputs to compute.
+        device: torch device.
+        threads: number of CPU threads.
+
+    Raises:
+        WeightsError: the weights cannot be used.
+        ConfigError: torch does not support the device.
+    """
+
+    precision = "float32"
+
+    def __init__(self, weights: Path, outputs: tuple[str, ...], device: str, threads: int) -> None:
+        import torch
+
+        from umf_ros.networks.umf import FlatUmf
+        from umf_ros.networks.weights import load_weights
+        from umf_ros.networks.xfeat import load_xfeat
+
+        self.file, self._outputs, self._torch = weights, outputs, torch
+        network = load_xfeat(weights) if outputs == XFEAT_OUTPUTS else FlatUmf(load_weights(weights), outputs)
+        if device == "cpu":
+            torch.set_num_threads(threads)
+        try:
+            self._device = torch.device(device)
+            self._network = network.eval().to(self._device)
+        except (RuntimeError, AssertionError) as error:
+            raise ConfigError(f"embedding.device: cannot use {device!r}: {str(error).splitlines()[0]}") from None
+
+    def run(self, inputs: Arrays) -> Outputs:
+        """Return the outputs of a batch of one; see `Runtime`."""
+        with self._torch.inference_mode():
+            found = self._network(*(self._torch.from_numpy(array).to(self._device) for array in inputs))
+        values = (value[0].float().cpu().numpy() for value in found)
+        return dict(zip(self._outputs, values, strict=True))
 
 
 def outputs_of(asked: FeatureRequest) -> tuple[str, ...]:
@@ -121,13 +160,9 @@ def make_runtime(weights: Path, settings: EmbeddingSettings, outputs: tuple[str,
     if _wants_openvino(weights, settings):
         runtime = OpenVinoRuntime(weights, outputs, threads)
     else:
-        from umf_ros.embedding.torch_runtimes import TorchRuntime
-
         runtime = TorchRuntime(weights, outputs, settings.device, threads)
-    try:
+    with reading(weights, WeightsError, "cannot be run"):
         runtime.run(blank)
-    except Exception as error:
-        raise WeightsError(f"{weights} cannot be run: {one_line(error)}") from None
     return runtime
 
 

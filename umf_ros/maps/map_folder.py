@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from umf_ros.core.config import Settings, dump_settings, load_settings
-from umf_ros.core.errors import UmfError, writing
+from umf_ros.core.errors import UmfError, reading, writing
 from umf_ros.core.frames import State
 from umf_ros.core.io import write_atomically
 from umf_ros.places.database import PLACES_OF_MAP
@@ -74,13 +74,11 @@ class MapFolder:
         if not (path / "map.json").is_file():
             raise UmfError(f"{path} is not a map: map.json is missing; make one with umf map")
         folder = cls(path)
-        try:
+        with reading(path / "map.json", UmfError, "is damaged"):
             content = json.loads((path / "map.json").read_text(encoding="utf-8"))
             if content["schema"] != SCHEMA_VERSION:
                 raise UmfError(f"{path} is from another version of umf_ros; rebuild the map from its recordings")
             folder.sessions = [MapSession(**session) for session in content["sessions"]]
-        except (OSError, ValueError, KeyError, TypeError):
-            raise UmfError(f"{path / 'map.json'} is damaged") from None
         return folder
 
     @classmethod
@@ -140,11 +138,9 @@ class MapFolder:
         """Decisions by hand about closures, by the stamps of match and query on the map's clock."""
         if not (self.path / EDITS).is_file():
             return {}
-        try:
+        with reading(self.path / EDITS, UmfError, "is damaged"):
             rows = json.loads((self.path / EDITS).read_text(encoding="utf-8"))
             return {(int(row["match"]), int(row["query"])): State(row["decision"]) for row in rows}
-        except (OSError, ValueError, KeyError, TypeError):
-            raise UmfError(f"{self.path / EDITS} is damaged") from None
 
     def write_edits(self, edits: Mapping[tuple[int, int], State]) -> None:
         """Replace the decisions by hand."""

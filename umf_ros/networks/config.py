@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 from safetensors import safe_open
 
 from umf_ros.core.config import problems
-from umf_ros.core.errors import WeightsError, one_line, shortened
+from umf_ros.core.errors import WeightsError, reading, shortened
 from umf_ros.core.resources import find
 
 CELLS = 40
@@ -123,15 +123,11 @@ def read_config(path: Path) -> NetworkConfig:
 @contextmanager
 def open_weights(path: Path, framework: str) -> Iterator[Any]:
     """Open a weights file; every error while it is read becomes a `WeightsError`."""
-    try:
+    with reading(path, WeightsError, "is truncated or not a safetensors file"):
         if not path.is_file():
             raise WeightsError(f"weights {shortened(path)} do not exist")
         with safe_open(path, framework=framework) as stream:
             yield stream
-    except WeightsError:
-        raise
-    except Exception as error:  # shapes that do not fit, sizes beyond the memory
-        raise WeightsError(f"{shortened(path)} is truncated or not a safetensors file: {one_line(error)}") from None
 
 
 def parse_architecture(path: Path, stream: Any) -> dict[str, Any]:

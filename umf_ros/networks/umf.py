@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from umf_ros.networks.config import NetworkConfig
@@ -45,6 +47,11 @@ class NetworkInput(NamedTuple):
     coarse_mask: Tensor
     fine_index: Tensor
     fine_mask: Tensor
+
+    @classmethod
+    def of(cls, arrays: Iterable[NDArray[Any]]) -> Self:
+        """Return a batch of arrays (`umf_ros.embedding.inputs.InputArrays`)."""
+        return cls(*(torch.from_numpy(array) for array in arrays))
 
     def to(self, device: torch.device) -> Self:
         """Return the batch on another device."""
@@ -156,6 +163,36 @@ class UMF(nn.Module):
         if super_features:
             supers = self.super_image(image.tokens, image.mask), self.super_cloud(cloud.tokens, cloud.mask)
         return NetworkOutput(fused.descriptor, image, cloud, *supers)
+
+
+class FlatUmf(nn.Module):
+    """The UMF network with tensors as arguments and results.
+
+    Args:
+        network: the network.
+        outputs: names of the results, as in `umf_ros.embedding.runtimes`.
+    """
+
+    def __init__(self, network: UMF, outputs: tuple[str, ...]) -> None:
+        super().__init__()
+        self.network = network
+        self.outputs = outputs
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Map the fields of `NetworkInput`, in their order, to the outputs."""
+        found: NetworkOutput = self.network(NetworkInput(*inputs), super_features="super_image" in self.outputs)
+        named: dict[str, Tensor] = {
+            "descriptor": found.descriptor,
+            "image_local": found.image.descriptors,
+            "image_saliency": found.image.saliency,
+            "cloud_local": found.cloud.descriptors,
+            "cloud_saliency": found.cloud.saliency,
+        }
+        for name in ("super_image", "super_cloud"):
+            supers = getattr(found, name)
+            if supers is not None:
+                named |= {name: supers.descriptors, f"{name}_strength": supers.strength}
+        return tuple(named[name] for name in self.outputs)
 
 
 def count_parameters(network: nn.Module) -> int:

@@ -23,12 +23,12 @@ from umf_ros.core.io import atomic_write
 from umf_ros.embedding.inputs import blank_input
 from umf_ros.embedding.local_features import network_size
 from umf_ros.embedding.runtimes import FACTS, OUTPUTS, SUPERS, XFEAT_SHAPE, import_openvino
-from umf_ros.embedding.torch_runtimes import FlatUmf, to_tensors
 from umf_ros.lab.datasets.views import read_frame
 from umf_ros.lab.simulation.camera import Camera
 from umf_ros.lab.simulation.survey import save, shard_plan, survey_world
 from umf_ros.lab.training.prepared_views import draw_look
 from umf_ros.networks.config import XFEAT_OUTPUTS, read_config
+from umf_ros.networks.umf import FlatUmf, NetworkInput
 from umf_ros.networks.weights import load_weights
 from umf_ros.networks.xfeat import load_xfeat
 from umf_ros.sensors.calibration import load_calibration
@@ -243,7 +243,7 @@ def _convert_umf(weights: Path, outputs: tuple[str, ...]) -> Any:
     stem = flat.network.voxel_encoder.get_submodule("stem.1")
     assert isinstance(stem, nn.Sequential) and isinstance(stem[0], nn.Conv3d)
     stem[0] = TwoRangeConvolution(stem[0], SMALL_VALUES)
-    return convert(flat, to_tensors(blank_input(read_config(weights)))._asdict(), outputs)
+    return convert(flat, NetworkInput.of(blank_input(read_config(weights)))._asdict(), outputs)
 
 
 def _convert_xfeat(weights: Path) -> Any:

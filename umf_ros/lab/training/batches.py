@@ -14,7 +14,6 @@ from torch.utils.data import DataLoader, Dataset
 
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.embedding.inputs import pack
-from umf_ros.embedding.torch_runtimes import to_tensors
 from umf_ros.lab.datasets.sample import Places, Rule, SampleSequence, label, places_of
 from umf_ros.lab.datasets.views import Matches, View, ViewMaker, cell_points, match_cells, match_voxels
 from umf_ros.networks.config import NetworkConfig
@@ -150,7 +149,7 @@ class TrainingBatch:
 def stack_views(views: Sequence[View], config: NetworkConfig) -> NetworkInput:
     """The views as one batch."""
     images = [view.image if view.image_present else None for view in views]
-    return to_tensors(pack(images, [view.scan for view in views], config, trim=True))
+    return NetworkInput.of(pack(images, [view.scan for view in views], config, trim=True))
 
 
 def _thin(batch: NetworkInput) -> NetworkInput:
