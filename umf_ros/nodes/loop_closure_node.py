@@ -22,6 +22,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
+from umf_ros.core import watchdog
 from umf_ros.core.config import FrameIds, Settings, topics_of
 from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line
 from umf_ros.core.frames import Frame, Keyframe, LoopClosure
@@ -53,8 +54,6 @@ if TYPE_CHECKING:
 
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
 INTAKE_QUEUE = 400
-ADDING_S = 50.0
-"""So long a map may take to grow: at the end, launch waits ten seconds more than that."""
 MESSAGE_TYPES = {"cloud": PointCloud2, "odometry": Odometry}
 MESSAGE_TYPES |= dict.fromkeys(("left_image", "right_image"), Image)
 MESSAGE_TYPES |= dict.fromkeys(("left_info", "right_info"), CameraInfo)
@@ -120,13 +119,17 @@ class LoopClosureNode(BaseNode):
         finally:
             self._detector.close()
         if self._settings.grows_map:
-            self._adder.close(timeout_s=ADDING_S)
+            self._adder.close(timeout_s=watchdog.PATIENT_S)
             self.get_logger().info(self._grow())
 
     def _grow(self) -> str:
-        """Add what was seen to the map, in a process of its own: its libraries are none of this node's."""
+        """Add what was seen to the map, in a process of its own.
+
+        In this one, GTSAM would hold the interpreter lock while it solves a large map. The process has its own session:
+        it finishes the map also where Ctrl-C or `ros2 launch` ends the node meanwhile.
+        """
         command = [sys.executable, "-m", "umf_ros.cli", "map", "grow", self._settings.map, self._results]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=ADDING_S)
+        done = subprocess.run(command, capture_output=True, text=True, check=False, start_new_session=True)
         if done.returncode:
             raise OutputError(f"{self._settings.map} stays as it was: {one_line(UmfError(done.stderr))}")
         return " ".join(done.stdout.split())
