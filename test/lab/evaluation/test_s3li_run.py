@@ -71,7 +71,7 @@ def test_precision_of_mprf_on_ten_images() -> None:
     record = {"precision1_hits": 3, "precision1_queries": 4, "samples": 10}
     rows = {row[0]: row for row in protocol_table({"s3li_crater": record | {"dataset": "s3li-etna"}})[1]}
     assert rows["Etna: MPRF P@1"][1:] == ["75.0", "30.1 to 95.4", "3 of 4", "75.7"]
-    assert rows["Etna: MPRF P@1, every image asked"][1] == "30.0"
+    assert rows["Etna: MPRF P@1, all queries"][1] == "30.0"
 
 
 def test_ground_that_two_views_share() -> None:

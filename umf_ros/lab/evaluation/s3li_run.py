@@ -389,7 +389,7 @@ PUBLISHED |= {("MPRF P@1", "s3li-etna"): "75.7", ("MPRF P@1", "s3li-vulcano"): "
 PROTOCOLS = (
     ("UMF R@1", "recall1_hits", "recall1_queries"),
     ("MPRF P@1", "precision1_hits", "precision1_queries"),
-    ("MPRF P@1, every image asked", "precision1_hits", "samples"),
+    ("MPRF P@1, all queries", "precision1_hits", "samples"),
     ("closures true by distance", "closures_true", "closures_judged"),
     ("closures true by overlap", "closures_overlapping", "closures_judged"),
     ("revisits closed", "revisits_closed", "revisits"),
