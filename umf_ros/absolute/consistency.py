@@ -1,9 +1,9 @@
 """Consistency of absolute measurements over time.
 
-The measurement of a source, less the odometry's of the same, changes slowly along the path where the source is right:
-by the drift of the odometry. Multipath jumps. The longest chain of measurements, each of which agrees with the one
-before over the odometry between, is found by dynamic programming; what is not on it contradicts what is.
-An error of the mounting turns with the rover, which tells it from drift.
+The difference between the measurements of a right source and the odometry changes slowly along the path, by the drift
+of the odometry; multipath makes it jump. Dynamic programming finds the longest chain of measurements in which each
+agrees with its predecessor within the drift of the odometry between them. Measurements outside the chain contradict it.
+A mounting error rotates with the rover, so it is distinguished from drift.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from umf_ros.core.geometry import Array, invert, make_pose
 from umf_ros.core.odometry_noise import OdometryNoise
 
 STRETCH_M = 10.0
-"""Measurements are averaged over so much of the path (*by hand*: multipath jumps further than odometry drifts)."""
+"""Path length over which measurements are averaged (*by hand*: multipath jumps further than odometry drifts in it)."""
 GATE = float(chi2.ppf(0.999, 3))
 """Largest squared Mahalanobis distance of a right measurement."""
 SUPPORT = 4
-"""Stretches of the path in a row that agree: by hand, longer than a rover drives through one reflection."""
-# by hand: stretches that a chain may leave out in a row
+"""Least number of consecutive stretches that agree (*by hand*: longer than the path through one reflection)."""
+# by hand: longest gap of a chain, in stretches
 _REACH = 60
-# by hand: the least jump that multipath makes, m; a chain across a longer tolerance proves nothing
+# by hand: least jump by multipath, m; a link with a larger tolerance proves nothing
 _LEAST_JUMP_M = 5.0
 # by hand: attitude of the solved map, rad, and systematic error of odometry per metre
 _ATTITUDE, _SYSTEMATIC, _SYSTEMATIC_RAD = np.deg2rad(1.0), 0.02, np.deg2rad(0.03)
 _HEADINGS = np.deg2rad(np.arange(0, 360, 5.0))
 _PAIRS = 5
-# by hand: errors of measurements beside each other are alike, so that a stretch counts as so many at most
+# by hand: most measurements that a stretch counts as, since errors of consecutive ones are correlated
 _MOST_COUNTED = 4
 _MOST_DRIFT_M = 2000
 _ALIGNED_STRETCHES = 40
 _FEW_STRETCHES = 15
-# by hand: mounting errors that matter, and how well they must be known: m for an antenna, rad for an IMU
+# by hand: least mounting error that is rejected, and its largest standard deviation: m for an antenna, rad for an IMU
 _MOUNTING = {Aid.GNSS: (0.5, 1.0), Aid.GRAVITY: (np.deg2rad(2.5), np.deg2rad(1.0))}
 _LEAST_SIGMA_M = 0.05
 _STEP = np.log(1.2)
 MOST_HELD = 400
-"""Factors of a session and source: each is a vertex, and all are solved with every event (*by hand*: over 4 km)."""
+"""Most factors per session and source (*by hand*: of 4 km): each adds a vertex, and every event solves all of them."""
 
 Rows = NDArray[np.int64]
 Decision = tuple[State, AbsoluteReason]
@@ -59,24 +59,24 @@ _MOUNTED_WRONG = State.REJECTED, AbsoluteReason.MOUNTING
 
 
 def position_drift(noise: OdometryNoise, path_m: Array) -> Array:
-    """Variance per axis (m^2) of the odometry's translation over path lengths, attitude being known at the start."""
+    """Return the variance per axis (m^2) of the odometry's translation over path lengths, from a known attitude."""
     random = noise.sigma_m**2 * path_m + noise.sigma_rad**2 * path_m**3 / 3
     return noise.scale**2 * random + (_ATTITUDE**2 + _SYSTEMATIC**2) * path_m**2
 
 
 def attitude_drift(noise: OdometryNoise, path_m: Array) -> Array:
-    """Variance per axis (rad^2) of the odometry's attitude over path lengths."""
+    """Return the variance per axis (rad^2) of the odometry's attitude over path lengths."""
     return (noise.scale * noise.sigma_rad) ** 2 * path_m + (_SYSTEMATIC_RAD * path_m) ** 2
 
 
 def longest_chain(values: Array, variances: Array, path_m: Array, drift: Array) -> NDArray[np.bool_]:
-    """(N,) members of the longest chain of measurements along the path.
+    """Return (N,) whether measurements are on the longest chain along the path.
 
     Args:
-        values: (N, 3) what drifts slowly.
+        values: (N, 3) differences that drift slowly.
         variances: (N, 3) of the values.
-        path_m: (N,) where they are along the path, rising.
-        drift: (K,) variance of the drift over 0, 1, 2, ... metres; beyond, the last.
+        path_m: (N,) increasing path lengths.
+        drift: (K,) variance of the drift over 0, 1, 2, ... metres; the last applies beyond.
     """
     best, before = np.ones(len(values)), np.full(len(values), -1)
     for row in range(1, len(values)):
@@ -85,7 +85,7 @@ def longest_chain(values: Array, variances: Array, path_m: Array, drift: Array) 
         spread = variances[start:row] + variances[row] + apart[:, None]
         fits = ((values[start:row] - values[row]) ** 2 / spread).sum(axis=1) <= GATE
         if fits.any():
-            chosen = int(np.argmax(np.where(fits, best[start:row], 0.0)[::-1]))  # of equals the nearest
+            chosen = int(np.argmax(np.where(fits, best[start:row], 0.0)[::-1]))  # the nearest of equals
             before[row] = row - 1 - chosen
             best[row] += best[before[row]]
     members, row = np.zeros(len(values), bool), int(np.argmax(best)) if len(values) else -1
@@ -95,7 +95,7 @@ def longest_chain(values: Array, variances: Array, path_m: Array, drift: Array) 
 
 
 def supported(members: NDArray[np.bool_], variances: Array, path_m: Array, drift: Array) -> NDArray[np.bool_]:
-    """(N,) members of a chain with enough others in a row whose links leave no room for a jump."""
+    """Return (N,) members of a chain with enough consecutive neighbours whose links tolerate no jump."""
     rows = np.flatnonzero(members)
     gaps = np.minimum(np.diff(path_m[rows]).astype(int), len(drift) - 1)
     room = np.sqrt(GATE * (variances[rows[1:]] + variances[rows[:-1]]).mean(axis=1) + GATE * drift[gaps])
@@ -106,11 +106,10 @@ def supported(members: NDArray[np.bool_], variances: Array, path_m: Array, drift
 
 
 def find_heading(measured: Array, mapped: Array, variances: Array, path_m: Array, drift: Array) -> float | None:
-    """Heading (rad) of an upright map in the world; None where too little of the path agrees on one.
+    """Return the heading (rad) of an upright map in the world; None where too little of the path agrees on one.
 
-    Every heading is tried; the right one lets the longest chain agree.
-
-    `measured` (N, 3) are positions in the world, `mapped` the same in the map; the others as for `longest_chain`.
+    The heading with the longest chain is chosen and refined. `measured` (N, 3) are positions in the world, `mapped` the
+    same positions in the map; the others as for `longest_chain`.
     """
     best: tuple[int, float, float] | None = None
     for heading in _HEADINGS:
@@ -130,22 +129,22 @@ def find_heading(measured: Array, mapped: Array, variances: Array, path_m: Array
 
 
 def turned(points: Array, heading: float) -> Array:
-    """(N, 3) points turned about z."""
+    """Return points (N, 3) rotated about z."""
     cos, sin = np.cos(heading), np.sin(heading)
     return points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1.0]])
 
 
 def body_offset(values: Array, variances: Array, rotations: Array, path_m: Array, drift: Array) -> tuple[Array, Array]:
-    """An error (3,) that turns with the body, and its covariance (3, 3).
+    """Return the error (3,) in `values` that rotates with the body, and its covariance (3, 3).
 
-    `values` (N, 3) are in the frame in which `rotations` (N, 3, 3) are those of the body; as for `longest_chain`.
+    `rotations` (N, 3, 3) are those of the body in the frame of the values; the others as for `longest_chain`.
     """
     pairs = [(row, row + step) for step in range(1, _PAIRS + 1) for row in range(len(values) - step)]
     first, second = np.array(pairs).reshape(-1, 2).T
     apart = drift[np.minimum((path_m[second] - path_m[first]).astype(int), len(drift) - 1)]
     stated = (variances[first] + variances[second]).mean(axis=1) + apart
     design, missed, weights = rotations[second] - rotations[first], values[second] - values[first], 1 / stated
-    for _ in range(3):  # reweighted: the chain is right, some of its links are not
+    for _ in range(3):  # iteratively reweighted: some links of the chain are outliers
         information = np.einsum("n,nji,njk->ik", weights, design, design) + 1e-9 * np.eye(3)
         offset = np.linalg.solve(information, np.einsum("n,nji,nj->i", weights, design, missed))
         left = np.square(missed - design @ offset).sum(axis=1) / stated
@@ -160,8 +159,8 @@ class Factor(NamedTuple):
     Attributes:
         stamp_ns: of its middle.
         middle: (4, 4) odometry there.
-        numbers: those that determine it.
-        make: makes the factor of a vertex with a number, in whose frame the middle is at a pose (4, 4).
+        numbers: values that identify the factor.
+        make: returns the factor of a vertex, given the pose (4, 4) of the middle in its frame and its number.
     """
 
     stamp_ns: int
@@ -172,14 +171,14 @@ class Factor(NamedTuple):
 
 @dataclass(frozen=True)
 class MeasuredPath:
-    """The path at N measurements, and where its stretches are.
+    """The path at N measurements, and its stretches.
 
     Attributes:
         odometry: (N, 4, 4) poses by odometry alone.
-        poses: (N, 4, 4) in the world, or in the map while it is not known how that lies in the world.
+        poses: (N, 4, 4) in the world, or in the map while its pose in the world is unknown.
         travel: (N,) m.
-        finished: stretches that are finished.
-        at_middle: stamp and odometry (4, 4) in the middle of a stretch.
+        finished: number of finished stretches.
+        at_middle: returns stamp and odometry (4, 4) in the middle of a stretch.
     """
 
     odometry: Array
@@ -201,7 +200,7 @@ class _Stretches:
 
     @classmethod
     def of(cls, values: Array, variances: Array, path: MeasuredPath) -> _Stretches:
-        """Averages of (N, 3) values over the finished stretches."""
+        """Return the averages of (N, 3) values over the finished stretches."""
         cells = (path.travel // STRETCH_M).astype(int)
         names, first, counts = np.unique(cells, return_index=True, return_counts=True)
         done = names < path.finished
@@ -215,9 +214,9 @@ class Track:
     """Measurements of one source in one session, and the decisions about them.
 
     Attributes:
-        mounting: error (2,) of the mounting ahead and to the left, m, or of the upward direction, rad, for which the
-            source is rejected; None: none was found.
-        factors: what is accepted, by the number of the stretch.
+        mounting: mounting error (2,), forward and left, m, or of the upward direction, rad, for which the source is
+            rejected; None if there is none.
+        factors: accepted stretches, by number.
     """
 
     def __init__(self, source: Aid, noise: OdometryNoise) -> None:
@@ -234,7 +233,7 @@ class Track:
         self.factors: dict[int, Factor] = {}
 
     def add(self, measurements: list[AbsoluteMeasurement]) -> None:
-        """Take measurements; their verdicts are open until `judge`."""
+        """Add measurements; they are pending until `judge`."""
         self._measurements = sorted([*self._measurements, *measurements], key=lambda one: one.stamp_ns)
         self._levers = np.array([one.lever for one in self._measurements])
         self._variances = np.array([np.diag(one.covariance) for one in self._measurements])
@@ -244,7 +243,7 @@ class Track:
 
     @property
     def held(self) -> dict[int, Factor]:
-        """Factors that hold the map, by stretch: all of them or, of a long path, evenly spread ones."""
+        """Factors of the graph, by stretch: all, or evenly spread ones of a long path."""
         every = -(-len(self.factors) // MOST_HELD)
         return {cell: one for cell, one in self.factors.items() if every < 2 or cell % every == 0}
 
@@ -255,7 +254,7 @@ class Track:
 
     @property
     def values(self) -> Array:
-        """(N, 3) what was measured."""
+        """(N, 3) values of the measurements."""
         return np.array([one.value for one in self._measurements])
 
     def verdicts(self) -> list[AbsoluteVerdict]:
@@ -265,7 +264,7 @@ class Track:
         return [AbsoluteVerdict(one.source, one.stamp_ns, *decision, *figure) for one, decision, figure in rows]
 
     def align(self, measured: Array, path: MeasuredPath) -> Array | None:
-        """`world_T_map` by the newest stretches of (N, 3) positions; None where they do not tell."""
+        """Return `world_T_map` by the newest stretches of (N, 3) positions; None while it is unknown."""
         mapped = path.poses[:, :3, 3] + apply(path.poses, self._levers)
         world, here = (_Stretches.of(points, self._variances, path) for points in (measured, mapped))
         newest = slice(-_ALIGNED_STRETCHES, None)
@@ -307,10 +306,10 @@ class Track:
                 self._decide(rows, mounted if sure else _UNSURE if member else _JUMPED)
 
     def _judge_stretch(self, cell: int, rows: Rows, near: NDArray[np.bool_]) -> Rows:
-        """Decide about the measurements of a stretch that is consistent with others; returns those that are accepted.
+        """Decide about the measurements of a consistent stretch; return the accepted ones.
 
-        Where it was in the map before, its measurements have to agree with that too. Of a stretch whose measurements
-        are mostly wrong the others are not believed.
+        If the stretch was in the map before, its measurements must also agree with the map. A stretch of which most
+        measurements are rejected is rejected as a whole.
         """
         agrees = near & ((self._distances[rows] <= GATE) | (cell not in self._solved))
         if 2 * agrees.sum() < len(rows):
@@ -331,9 +330,9 @@ class Track:
         self._misfits, self._distances = np.full((2, len(self._measurements)), np.nan)
 
     def _drifting(self, measured: Array, path: MeasuredPath) -> tuple[Array, Array]:
-        """(N, 3) what drifts slowly, and the rotations (N, 3, 3) of the body with which an error of its mounting turns.
+        """Return the (N, 3) values that drift slowly, and the rotations (N, 3, 3) of the body in their frame.
 
-        Positions less those by dead reckoning with the attitudes of the map; directions by the odometry's attitudes.
+        The values are positions minus dead reckoning by the map's attitudes, or directions in the odometry's frame.
         """
         if self._source is Aid.GRAVITY:
             return apply(path.odometry, measured), path.odometry[:, :3, :3]
@@ -342,9 +341,9 @@ class Track:
         return measured - walked - apply(path.poses, self._levers), path.poses[:, :3, :3]
 
     def _judge_mounting(self, stretches: _Stretches, members: NDArray[np.bool_], rotations: Array) -> Decision:
-        """Whether a source may be accepted, by what its error does when the rover turns."""
+        """Return whether a source may be accepted, by the error that rotates with the rover."""
         large, well_known = _MOUNTING[self._source]
-        unknown = _AGREES  # an antenna that is off does little before the rover has turned
+        unknown = _AGREES  # a lever-arm error has little effect before the rover turns
         if self._source is Aid.GRAVITY:
             unknown = State.PENDING, AbsoluteReason.NOT_TURNED
         if members.sum() < _FEW_STRETCHES:
@@ -353,7 +352,7 @@ class Track:
         parts = stretches.middles, stretches.spreads, turns, stretches.travel
         values, spreads, turns, travel = (part[members] for part in parts)
         offset, covariance = body_offset(values, spreads, turns, travel, self._drift)
-        offset, covariance = offset[:2], covariance[:2, :2]  # along the vertical, the rover does not turn
+        offset, covariance = offset[:2], covariance[:2, :2]  # turns about the vertical do not show the third
         if np.sqrt(np.linalg.eigvalsh(covariance).max()) > well_known:
             return unknown
         if np.linalg.norm(offset) > large and float(offset @ np.linalg.solve(covariance, offset)) > GATE:
@@ -362,16 +361,16 @@ class Track:
         return _AGREES
 
     def _missed(self, measured: Array, path: MeasuredPath) -> Array:
-        """(N, 3) by what the measurements miss the map."""
+        """Return the (N, 3) residuals of the measurements in the map."""
         if self._source is Aid.GRAVITY:
             return apply(path.poses, measured) - [0.0, 0.0, 1.0]
         return measured - path.poses[:, :3, 3] - apply(path.poses, self._levers)
 
     def _average(self, cell: int, rows: Rows, measured: Array, path: MeasuredPath) -> None:
-        """Make the factor of a stretch: on a rigid path, the mean of positions is that of the mean of their levers."""
+        """Make the factor of a stretch: the mean position, at the mean of the lever arms along the path."""
         stamp_ns, middle = path.at_middle(cell)
         there = invert(middle) @ path.odometry[rows]
-        # as of one measurement: errors of GNSS last for longer than a stretch
+        # that of one measurement: errors of GNSS are correlated over more than a stretch
         covariance = np.mean([self._measurements[row].covariance for row in rows], axis=0) * self._scale**2
         if self._source is Aid.GNSS:
             mean = measured[rows].mean(axis=0)
@@ -393,12 +392,12 @@ class Track:
 
 
 def apply(poses: Array, vectors: Array) -> Array:
-    """(N, 3) vectors turned by the rotations of (N, 4, 4) poses."""
+    """Return vectors (N, 3) rotated by poses (N, 4, 4)."""
     return (poses[:, :3, :3] @ vectors[..., None])[..., 0]
 
 
 def _scatter(values: Array, variances: Array, stretches: _Stretches) -> float:
-    """By how much measurements scatter more than they state: one at least, in steps, so that averages stay."""
+    """Return the factor by which measurements scatter more than stated, at least 1, in steps: it changes rarely."""
     ratios = [
         np.abs(values[rows] - middle) / np.sqrt(variances[rows])
         for rows, middle in zip(stretches.rows, stretches.middles, strict=True)

@@ -15,7 +15,7 @@ from umf_ros.core.errors import ConfigError, reading
 from umf_ros.core.geometry import Array, from_enu
 
 _HUBER = 1.345
-# by hand: along the ground a height says nothing; between the middles of cells a slope is known to a quarter of one
+# by hand: sigma along the ground, which a height does not measure; sigma of the position on a slope, in cells
 _TANGENT_M, _CELL_SHARE = 100.0, 0.25
 
 
@@ -24,8 +24,8 @@ class ElevationModel:
     """Heights of the ground on a regular grid.
 
     Attributes:
-        heights: (H, W) m, NaN where unknown; row by row, a height is that of the middle of its cell.
-        pixel_T_world: (2, 3) column and row of a point x, y, 1 in the world frame, m.
+        heights: (H, W) m at the centres of the cells, NaN where unknown.
+        pixel_T_world: (2, 3) maps x, y, 1 in the world frame, m, to column and row.
         cell_m: size of a cell.
         sigma_m: standard deviation of the heights.
     """
@@ -36,13 +36,13 @@ class ElevationModel:
     sigma_m: float
 
     def shifted(self, shift: Array) -> ElevationModel:
-        """The same ground (2,) metres further."""
+        """Return the model shifted by (2,) metres."""
         moved = self.pixel_T_world.copy()
         moved[:, 2] -= moved[:, :2] @ shift
         return replace(self, pixel_T_world=moved)
 
     def at(self, positions: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Heights (N,) m and slopes (N, 2) of the ground at positions (N, 2), interpolated, and (N,) whether known."""
+        """Return interpolated heights (N,) m and slopes (N, 2) at positions (N, 2), and (N,) whether they are known."""
         columns, rows = self.pixel_T_world[:, :2] @ positions.T + self.pixel_T_world[:, 2:]
         column, row = np.floor(columns).astype(int), np.floor(rows).astype(int)
         height, width = self.heights.shape
@@ -56,9 +56,9 @@ class ElevationModel:
         return heights, by_pixel @ self.pixel_T_world[:, :2], known & np.isfinite(heights)
 
     def misfits(self, poses: Array, is_free: bool) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """(N,) m by which world poses (N, 4, 4) are above the ground, their sigmas, and whether the ground is known.
+        """Return heights (N,) m of world poses (N, 4, 4) above the ground, their sigmas, and whether they are known.
 
-        With `is_free` heights count from elsewhere: GNSS counts from the ellipsoid, models mostly from the geoid.
+        With `is_free` their median is removed: GNSS heights refer to the ellipsoid, models mostly to the geoid.
         """
         ground, slopes, known = self.at(poses[:, :2, 3])
         missed = np.where(known, poses[:, 2, 3] - ground, 0.0)
@@ -68,7 +68,7 @@ class ElevationModel:
         return missed, np.hypot(self.sigma_m, _CELL_SHARE * self.cell_m * steepness), known
 
     def planes(self, poses: Array, is_free: bool, gate: float) -> list[Callable[[int], gtsam.NonlinearFactor] | None]:
-        """N makers of factors that hold a vertex on the plane of the ground under a pose.
+        """Return N functions that make the factor of a vertex on the ground plane under a pose.
 
         None where the ground is unknown, or more than `gate` sigmas away.
         """
@@ -82,7 +82,7 @@ class ElevationModel:
 
 
 def _plane(point: Array, normal: Array, sigma_m: float) -> Callable[[int], gtsam.NonlinearFactor]:
-    """Maker of a factor of a plane through a point, `sigma_m` is vertical."""
+    """Return a function that makes the factor of a plane through a point; `sigma_m` is vertical."""
     size = float(np.linalg.norm(normal))
     across = np.outer(normal, normal) / size**2
     spread = (sigma_m / size) ** 2 * across + _TANGENT_M**2 * (np.eye(3) - across)
@@ -94,13 +94,13 @@ def _plane(point: Array, normal: Array, sigma_m: float) -> Callable[[int], gtsam
 def load_elevation(path: Path, sigma_m: float, origin: Array | None) -> ElevationModel:
     """Read a GeoTIFF, an ESRI ASCII grid (.asc), or an .npz with `heights`, `cell_m`, `x0_m` and `y0_m`.
 
-    The heights of an .npz begin at the middle of the cell at `x0_m`, `y0_m`; columns go east, rows north.
+    In an .npz, `x0_m`, `y0_m` are the centre of the first cell; columns go east, rows north.
 
     Args:
         path: the file.
-        sigma_m: of the heights.
-        origin: (3,) of the world frame on WGS 84, which a GeoTIFF with geographic reference needs; others are in metres
-            of the world frame.
+        sigma_m: standard deviation of the heights.
+        origin: (3,) of the world frame on WGS 84, required by a GeoTIFF with geographic reference; other files are in
+            metres of the world frame.
 
     Raises:
         ConfigError: the file cannot be read, or rasterio is not installed.
@@ -113,13 +113,13 @@ def load_elevation(path: Path, sigma_m: float, origin: Array | None) -> Elevatio
         else:
             heights, to_pixel = _read_geotiff(path, origin)
     if heights.ndim != 2 or min(heights.shape) < 2 or not np.isfinite(to_pixel).all():
-        raise ConfigError(f"elevation model {path} is no grid of heights")
+        raise ConfigError(f"elevation model {path} is not a grid of heights")
     cell_m = float(1 / np.sqrt(abs(np.linalg.det(to_pixel[:, :2]))))
     return ElevationModel(heights, to_pixel, cell_m, sigma_m)
 
 
 def _read_arrays(path: Path) -> tuple[Array, Array]:
-    """Heights, and the columns and rows of points; as the other readers."""
+    """Return heights and `pixel_T_world`, like the other readers."""
     with np.load(path) as stored:
         heights, cell, x0, y0 = (np.asarray(stored[name], float) for name in ("heights", "cell_m", "x0_m", "y0_m"))
     return heights, np.array([[1, 0, -x0], [0, 1, -y0]], float) / float(cell)

@@ -20,14 +20,14 @@ from umf_ros.core.io import write_table
 VERDICT_COLUMNS = ("source", "stamp_ns", "verdict", "reason", "mahalanobis", "misfit")
 """Columns of a table of verdicts; the misfit is in metres, that of gravity in radians."""
 _UNKNOWN_COVARIANCE, _NO_FIX = 0, 0
-# by hand: an IMU stands still while it turns by less than this and its acceleration varies by less
+# by hand: an IMU is at rest while its angular rate and its acceleration vary by less
 _REST_RAD_S, _REST_M_S2, _REST_S, _GRAVITY_M_S2, _GRAVITY_TOLERANCE = 0.02, 0.15, 1.0, 9.81, 0.3
-# by hand: of attitudes without a covariance, and the least that one states, rad
+# by hand: sigma of attitudes without a covariance, and least sigma, rad
 _ATTITUDE_SIGMA, _LEAST_ATTITUDE_SIGMA = np.deg2rad(1.0), np.deg2rad(0.3)
 
 
 class Aid(StrEnum):
-    """Kind of an absolute measurement, an aiding sensor or model."""
+    """Source of an absolute measurement."""
 
     GNSS = "gnss"
     GRAVITY = "gravity"
@@ -35,7 +35,7 @@ class Aid(StrEnum):
 
 
 ABSOLUTE_TYPES = {Aid.GNSS: "sensor_msgs/msg/NavSatFix", Aid.GRAVITY: "sensor_msgs/msg/Imu"}
-"""Types of message of measurements."""
+"""Message types of the sources."""
 
 
 class AbsoluteReason(StrEnum):
@@ -44,12 +44,12 @@ class AbsoluteReason(StrEnum):
     AGREES = "agrees with the odometry over time"
     NO_ODOMETRY_YET = "its odometry has not arrived"
     INCOMPLETE = "its stretch of the path is not finished"
-    NOT_ALIGNED = "the path does not say yet how the map lies in the world"
-    UNSURE = "too little of the path beside it agrees"
+    NOT_ALIGNED = "the pose of the map in the world is not known yet"
+    UNSURE = "too few neighbouring stretches agree"
     NOT_TURNED = "the rover has not turned enough to check the mounting"
-    JUMPED = "contradicts the odometry beside it"
+    JUMPED = "contradicts the odometry over time"
     CONTRADICTS = "contradicts the map"
-    MOUNTING = "its sensor is not mounted as the calibration says"
+    MOUNTING = "the mounting of the sensor differs from the calibration"
     MISFIT = "the elevation model does not fit the path"
     OUTSIDE = "outside the elevation model"
     UNUSABLE = "position or covariance is not usable"
@@ -80,14 +80,14 @@ class AbsoluteMeasurement:
 
     @classmethod
     def stored(cls, source: str, stamp_ns: int, numbers: Array) -> AbsoluteMeasurement:
-        """The measurement of stored `numbers`; a ValueError where they are none."""
+        """Return the measurement of stored `numbers`; raise a `ValueError` if they are none."""
         if np.shape(numbers) != (15,):
             raise ValueError(f"an absolute measurement of {np.size(numbers)} numbers")
         return cls(Aid(source), stamp_ns, numbers[:3], numbers[3:12].reshape(3, 3), numbers[12:])
 
     @property
     def is_usable(self) -> bool:
-        """Whether all is finite, and the covariance positive."""
+        """Whether all numbers are finite and plausible, and the covariance is positive."""
         if not np.isfinite(self.numbers).all() or np.linalg.eigvalsh(self.covariance).min() <= 0:
             return False
         if self.source is Aid.GRAVITY:
@@ -99,12 +99,12 @@ class AbsoluteVerdict(NamedTuple):
     """Decision about one absolute measurement at one moment.
 
     Attributes:
-        source: what kind.
-        stamp_ns: of the measurement, or of the pose below which the elevation was looked up.
+        source: its source.
+        stamp_ns: of the measurement, or of the pose above the ground.
         state: accepted, pending, rejected, or refused when the message itself is unusable.
-        reason: why.
+        reason: its reason.
         residual: Mahalanobis distance to the map, NaN if unknown.
-        misfit: the same distance in metres, or in radians for gravity.
+        misfit: the distance in metres, or in radians for gravity.
     """
 
     source: Aid
@@ -116,7 +116,7 @@ class AbsoluteVerdict(NamedTuple):
 
 
 def write_verdicts(path: Path, verdicts: Iterable[AbsoluteVerdict]) -> None:
-    """Write the table of verdicts; an `OutputError` where that cannot be done."""
+    """Write the table of verdicts; raise an `OutputError` if it cannot be written."""
     rows = (
         [one.source.value, one.stamp_ns, one.state.value, one.reason.value, f"{one.residual:.3f}", f"{one.misfit:.4f}"]
         for one in verdicts
@@ -125,7 +125,7 @@ def write_verdicts(path: Path, verdicts: Iterable[AbsoluteVerdict]) -> None:
 
 
 def read_verdict_counts(path: Path) -> Counter[tuple[str, str, str]]:
-    """How many measurements have which source, verdict and reason by the table of a run; none without a table."""
+    """Return the number of measurements by source, verdict and reason in the table of a run; empty without a table."""
     if not path.is_file():
         return Counter()
     with path.open(newline="", encoding="utf-8") as file:
@@ -133,10 +133,10 @@ def read_verdict_counts(path: Path) -> Counter[tuple[str, str, str]]:
 
 
 def decode_fix(message: Any, stamp_ns: int, lever: Array) -> AbsoluteMeasurement:
-    """Position of a sensor_msgs/NavSatFix.
+    """Return the position of a sensor_msgs/NavSatFix.
 
     Raises:
-        MessageError: of kind "no fix" or "covariance": the receiver has no position, or does not say how good it is.
+        MessageError: of kind "no fix", "covariance" (it is unknown) or "fix" (numbers are not usable).
     """
     if message.status.status < _NO_FIX:
         raise MessageError("no fix", "the GNSS receiver has no fix")
@@ -151,9 +151,9 @@ def decode_fix(message: Any, stamp_ns: int, lever: Array) -> AbsoluteMeasurement
 
 
 class GravityFilter:
-    """Makes upward directions of sensor_msgs/Imu messages, two per second at most.
+    """Filter of sensor_msgs/Imu messages that gives upward directions, at most two per second.
 
-    From the orientation where the driver gives one, else from the mean acceleration over a second at rest.
+    They come from the orientation if the driver states one, else from the mean acceleration over a second at rest.
     """
 
     def __init__(self) -> None:
@@ -161,10 +161,10 @@ class GravityFilter:
         self._last_ns = -(10**18)
 
     def take(self, message: Any, stamp_ns: int, body_R_imu: Array) -> AbsoluteMeasurement | None:
-        """Take one message of an IMU that is turned so (3, 3) on the body; returns a measurement now and then.
+        """Add one message of an IMU with the rotation (3, 3) on the body; return a measurement if one is due.
 
         Raises:
-            MessageError: of kind "imu": its orientation is none.
+            MessageError: of kind "imu": its orientation is not a rotation.
         """
         self._body_R_imu = body_R_imu
         if message.orientation_covariance[0] < 0:
@@ -182,7 +182,7 @@ class GravityFilter:
         return self._measured(world_T_imu[2, :3], sigma, stamp_ns)
 
     def _at_rest(self, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
-        """The mean acceleration of the last second, if the IMU stood still meanwhile."""
+        """Return the direction of the mean acceleration over the last second, if the IMU was at rest."""
         force, rate = (
             [vector.x, vector.y, vector.z] for vector in (message.linear_acceleration, message.angular_velocity)
         )
@@ -208,12 +208,12 @@ class GravityFilter:
 
 
 class AbsoluteDecoder:
-    """Decodes the messages of GNSS and IMU, the same live and offline.
+    """Decoder of GNSS and IMU messages, live and offline.
 
     Args:
         antenna: (3,) m, body frame.
         body_T_imu: (4, 4).
-        find: pose (4, 4) of a frame on the body by `/tf_static`, which goes before those; None where it is unknown.
+        find: returns the pose (4, 4) of a frame on the body by `/tf_static`, which has priority; None if it is unknown.
     """
 
     def __init__(self, antenna: Array, body_T_imu: Array, find: Callable[[str], Array | None]) -> None:
@@ -221,7 +221,7 @@ class AbsoluteDecoder:
         self._gravity = GravityFilter()
 
     def decode(self, source: Aid, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
-        """The measurement in a message; None where an IMU has nothing to say yet.
+        """Return the measurement in a message; None if an IMU has none yet.
 
         Raises:
             MessageError: the message cannot be used.
@@ -234,7 +234,7 @@ class AbsoluteDecoder:
 
 
 def parse_numbers(text: str, count: int, what: str) -> Array | None:
-    """(count,) numbers of a parameter; None where it is empty; a `ConfigError` where it is something else."""
+    """Return (count,) numbers of a parameter; None if it is empty; raise a `ConfigError` otherwise."""
     if not text.strip():
         return None
     try:

@@ -1,11 +1,11 @@
 """Absolute measurements of a pose graph, and its solution with those that are accepted.
 
-`Track` decides about GNSS and gravity by their consistency over time. An elevation model is tried as a whole: the graph
-is solved with its heights, which is taken back where they cost more than their errors explain, or where they would fit
-elsewhere as well.
+`Track` decides about GNSS and gravity by their consistency over time. An elevation model is tested as a whole: the
+graph is solved with its heights, and the model is rejected if they cost more than their errors explain, or if they fit
+as well at another place.
 
-The graph is solved in the world frame (east, north, up of the origin) and moved back, so that the map frame stays where
-the odometry began: `worlds` says where that is.
+The graph is solved in the world frame (east, north, up of the origin) and transformed back, so that the map frame stays
+at the start of the odometry; `worlds` has its pose.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ if TYPE_CHECKING:  # the pose graph lies above
     from umf_ros.pose_graph.odometry import OdometryChain
     from umf_ros.pose_graph.sessions import Sessions
 
-# standard deviations (m, rad) of the first pose in the world: found out, as a start pose says, and fixed
+# standard deviations (m, rad) of the first pose in the world: free, fixed, of a start pose
 _FREE, _FIXED, _START_M, _START_RAD = 1e3, 1e-6, 5.0, np.deg2rad(5.0)
 _FEW_HEIGHTS, _HEIGHT_GATE = 15, 3.5
-# by hand: largest cost per height that a right elevation model adds, its own noise and the odometry's strain together;
-# nats that it fits better than anywhere else; share of the heights that fit
+# by hand: largest additional cost per height of a right elevation model; evidence against other places, nats; least
+# share of heights within the gate
 _MOST_COST, _EVIDENCE, _LEAST_FITTING = 1.0, 12.0, 0.8
-# by hand: where else a model is tried, m; by which factor the path grows until the next test
+# by hand: shifts of a model in the test, m; growth of the path until the next test
 _ELSEWHERE_M = 50.0 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0.7, 0.7], [-0.7, -0.7]])
 _RETEST = 1.3
 _ROUNDS, _TEST_ROUNDS = 1, 5
@@ -56,7 +56,7 @@ Factors = Sequence[tuple[int, Callable[[int], gtsam.NonlinearFactor]]]
 
 
 class Held(NamedTuple):
-    """A graph held in the world: poses (N, 4, 4) there, factors of vertices, noise of anchors that may move."""
+    """A graph in the world: poses (N, 4, 4), factors of vertices, and noise of the anchors that are not fixed."""
 
     poses: Array
     absolute: Factors
@@ -68,8 +68,8 @@ class _Heights:
     """The elevation model under one component of the map.
 
     Attributes:
-        fits: whether it is believed; None while that is not known.
-        tested: stretches at the last test.
+        fits: whether it is accepted; None while it is pending.
+        tested: number of stretches at the last test.
         misfits: sigmas and metres of the ground under each stretch, by session and stamp.
     """
 
@@ -78,7 +78,7 @@ class _Heights:
     misfits: dict[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
 
     def verdict(self, stamp_ns: int, sigmas: float, misfit_m: float) -> AbsoluteVerdict:
-        """Decision about one height."""
+        """Return the verdict on one height."""
         if not self.fits:
             known = (
                 (State.PENDING, AbsoluteReason.UNSURE) if self.fits is None else (State.REJECTED, AbsoluteReason.MISFIT)
@@ -100,7 +100,7 @@ class AbsoluteReference:
         worlds: `world_T_map` (4, 4) of components of the map, by their earliest session.
 
     Raises:
-        ConfigError: a parameter is not what it should be, or the elevation model cannot be read.
+        ConfigError: a parameter is wrong, or the elevation model cannot be read.
     """
 
     def __init__(self, settings: PoseGraphSettings) -> None:
@@ -120,7 +120,7 @@ class AbsoluteReference:
         self._rounds = _ROUNDS
 
     def add(self, measurement: AbsoluteMeasurement) -> None:
-        """Take one measurement, in any order; a second one of a stamp is dropped."""
+        """Add one measurement, in any order; a second one of a stamp is dropped."""
         key = measurement.source, measurement.stamp_ns
         if key in self._known:
             return
@@ -131,7 +131,7 @@ class AbsoluteReference:
             self._refused.append(AbsoluteVerdict(*key, State.REFUSED, AbsoluteReason.UNUSABLE))
 
     def decide(self, paths: Sessions, solve: Callable[[], None], at_last: bool = False) -> None:
-        """Decide about all measurements, and `solve` the graph where the accepted ones have changed.
+        """Decide about all measurements, and `solve` the graph if the accepted ones have changed.
 
         Raises:
             GraphError: it cannot be solved.
@@ -161,7 +161,7 @@ class AbsoluteReference:
         return found + self._refused
 
     def report(self) -> dict[str, object]:
-        """How many measurements have which state, by source, and what speaks against a source as a whole."""
+        """Return the number of measurements by source and state, and why a source is rejected as a whole."""
         counts = Counter(f"{one.source.value} {one.state.value}" for one in self.verdicts())
         found: dict[str, object] = dict(sorted(counts.items()))
         for (_, source), track in self._tracks.items():
@@ -176,7 +176,7 @@ class AbsoluteReference:
         return found
 
     def stamps(self, session: int, travel: Array) -> Rows:
-        """(K,) stamps of more vertices that accepted measurements of a session need, beside those at (N,) `travel`."""
+        """Return (K,) stamps of further vertices that accepted measurements need, beside those at (N,) `travel`."""
         held = set((travel // STRETCH_M).astype(int).tolist())
         stamps = [
             one.stamp_ns
@@ -202,12 +202,12 @@ class AbsoluteReference:
         components: list[int],
         optimum: Callable[[Held], Array],
     ) -> Array:
-        """(N, 4, 4) poses of a graph's vertices with all accepted measurements, in its own frames.
+        """Return (N, 4, 4) poses of a graph's vertices with all accepted measurements, in the frames of its components.
 
         Args:
             points: (N,) odometry at the vertices.
-            anchors: vertices that stay where they are, the first one of each component.
-            poses: (N, 4, 4) to start from.
+            anchors: fixed vertices, the first one of each component.
+            poses: (N, 4, 4) initial values.
             components: the earliest session of each session's component.
             optimum: solves the graph.
 
@@ -238,13 +238,13 @@ class AbsoluteReference:
             held = optimum(Held(held, factors + ground, loose))
         for component, first in firsts.items():
             if first in loose:
-                # a rotation that is multiplied at every solution drifts off without
+                # products of many rotations lose their orthonormality
                 self.worlds[component] = orthonormal((held[first] @ invert(poses[first]))[None])[0]
                 held[of == component] = orthonormal(invert(self.worlds[component]) @ held[of == component])
         return held
 
     def _place(self, paths: Sessions) -> bool:
-        """Give measurements whose odometry has arrived to their tracks; True where one is of a finished stretch."""
+        """Add measurements whose odometry has arrived to their tracks; return whether one is of a finished stretch."""
         waiting, placed, late = [], dict[tuple[int, Aid], list[AbsoluteMeasurement]](), False
         for one in self._waiting:
             session = paths.find(one.stamp_ns)
@@ -259,9 +259,9 @@ class AbsoluteReference:
         return late
 
     def _judge(self, paths: Sessions, at_last: bool) -> bool:
-        """Decide about the tracks; returns whether what is accepted has changed."""
+        """Decide about the tracks; return whether the accepted factors have changed."""
         changed = False
-        # gravity before GNSS: both say how the map lies in the world, and GNSS says more
+        # gravity before GNSS: both determine the pose of the map in the world, GNSS more of it
         for (session, source), track in sorted(
             self._tracks.items(), key=lambda one: (one[0][1] is Aid.GNSS, one[0][0])
         ):
@@ -297,7 +297,7 @@ class AbsoluteReference:
         )
 
     def _measured(self, source: Aid, track: Track) -> Array:
-        """(N, 3) positions in the world, or upward directions in the body."""
+        """Return (N, 3) positions in the world, or upward directions in the body."""
         if source is not Aid.GNSS:
             return track.values
         if self.origin is None:
@@ -311,14 +311,14 @@ class AbsoluteReference:
             self._model = load_elevation(Path(settings.elevation_model), settings.elevation_sigma_m, self.origin)
 
     def _has_gnss(self, component: int, paths: Sessions) -> bool:
-        """Whether accepted fixes hold a component in the world."""
+        """Return whether a component has accepted fixes."""
         tracks = ((session, track) for (session, source), track in self._tracks.items() if source is Aid.GNSS)
         return any(bool(track.factors) and paths.components[session] == component for session, track in tracks)
 
     def _judge_heights(
         self, model: ElevationModel, component: int, paths: Sessions, solve: Callable[[], None], at_last: bool
     ) -> None:
-        """Test now and then whether an elevation model fits the path; its heights are in the map where it does."""
+        """Test an elevation model as the path grows, and use its heights if it fits."""
         if component not in self._heights and not self._has_gnss(component, paths):
             if self._start is None or component not in paths.begun:
                 return
@@ -338,9 +338,9 @@ class AbsoluteReference:
             self._fitting(model, component, paths)
 
     def _test(self, model: ElevationModel, component: int, paths: Sessions, solve: Callable[[], None]) -> None:
-        """Solve with the heights, and take that back where they do not fit, or fit elsewhere as well.
+        """Solve with the heights; restore the graph if they do not fit, or fit as well at another place.
 
-        The first time, the model is tried at other places too: heights that fit there say nothing.
+        The first time, the model is also tested with shifts: heights that fit there are no evidence.
         """
         heights = self._heights[component]
         believed, heights.fits, heights.tested = heights.fits, False, len(heights.misfits)
@@ -361,7 +361,7 @@ class AbsoluteReference:
     def _try(
         self, model: ElevationModel, component: int, paths: Sessions, solve: Callable[[], None], cost: float
     ) -> tuple[float, float]:
-        """Solve with the heights of a model; returns what each costs, and the share of them that fit."""
+        """Solve with the heights of a model; return the cost per height, and the share that fits."""
         heights, given = self._heights[component], self._model
         heights.fits, self._rounds, self._model = True, _TEST_ROUNDS, model
         try:
@@ -373,7 +373,7 @@ class AbsoluteReference:
             heights.fits, self._rounds, self._model = False, _ROUNDS, given
 
     def _fitting(self, model: ElevationModel, component: int, paths: Sessions) -> float:
-        """Measure all heights against the map; returns the share that fit, 0 where the model covers less than half."""
+        """Compare all heights with the map; return the share that fits, 0 if the model covers less than half."""
         heights, poses = self._heights[component], list[Array]()
         keys = sorted(heights.misfits)
         for session in sorted({session for session, _ in keys}):
@@ -385,14 +385,14 @@ class AbsoluteReference:
         return float((ratios[known] <= _HEIGHT_GATE).mean()) if 2 * known.sum() >= len(known) else 0.0
 
     def _planes(self, poses: Array, rows: list[int], is_free: bool) -> Factors:
-        """Factors of the ground under rows of world poses (N, 4, 4)."""
+        """Return the factors of the ground under rows of world poses (N, 4, 4)."""
         assert self._model is not None
-        gate = np.inf if self._rounds == _TEST_ROUNDS else _HEIGHT_GATE  # in a test the ground may be far below
+        gate = np.inf if self._rounds == _TEST_ROUNDS else _HEIGHT_GATE  # in a test the ground may be far away
         planes = self._model.planes(poses[rows], is_free, gate)
         return [(row, make) for row, make in zip(rows, planes, strict=True) if make is not None]
 
     def _begin_at(self, start: Array, model: ElevationModel, component: int, paths: Sessions) -> None:
-        """Say how a component lies in the world by x, y and heading of its first pose; gravity may have levelled it."""
+        """Set the pose of a component in the world by x, y and heading of its first pose, and by gravity if known."""
         chain = paths.chains[component]
         first = paths.at(chain.at(chain.stamps[:1]))[0]
         level = self.worlds.get(component, np.eye(4))
@@ -402,7 +402,7 @@ class AbsoluteReference:
 
 
 def _attached(track: Track, session: int, points: NDArray[np.void]) -> Factors:
-    """Factors of a track, each at the vertex that is nearest to the middle of its stretch: the odometry carries it."""
+    """Return the factors of a track, each at the vertex nearest to its middle, connected by the odometry between."""
     own, factors = np.flatnonzero(points["session"] == session), track.held
     travel, middles = points["travel"][own], (np.array(list(factors)) + 0.5) * STRETCH_M
     after = np.searchsorted(travel, middles).clip(1, max(1, len(own) - 1))
@@ -415,19 +415,19 @@ def _attached(track: Track, session: int, points: NDArray[np.void]) -> Factors:
 
 
 def _finished(chain: OdometryChain) -> tuple[int, int]:
-    """Number of the finished stretches of a session, and the stamp at the end of the last."""
+    """Return the number of finished stretches of a session, and the stamp at the end of the last."""
     cell = int(chain.travel[-1] // STRETCH_M)
     return cell, int(chain.stamps[np.searchsorted(chain.travel, cell * STRETCH_M)])
 
 
 def _middle(chain: OdometryChain, cell: int) -> Rows:
-    """(1,) stamp of the keyframe in the middle of a stretch."""
+    """Return the stamp (1,) of the keyframe in the middle of a stretch."""
     row = min(int(np.searchsorted(chain.travel, (cell + 0.5) * STRETCH_M)), len(chain.travel) - 1)
     return chain.stamps[row : row + 1]
 
 
 def _first_pose_noise(pose: Array, sources: set[Aid]) -> gtsam.noiseModel.Base:
-    """Noise of the first pose of a component, which some sources leave where it is and others find out."""
+    """Return the noise of the first pose of a component, by the sources that determine it."""
     tilt, turn, across, up = _START_RAD, _FIXED, _FIXED, _FIXED
     if Aid.ELEVATION in sources:
         turn, across, up = _START_RAD, _START_M, _FREE
@@ -435,13 +435,13 @@ def _first_pose_noise(pose: Array, sources: set[Aid]) -> gtsam.noiseModel.Base:
         turn, across, up = 10 * _START_RAD, _FREE, _FREE
     if sources & {Aid.GNSS, Aid.GRAVITY}:
         tilt = 10 * _START_RAD
-    axes = np.kron(np.eye(2), pose[:3, :3].T)  # from those of the world to those of the body
+    axes = np.kron(np.eye(2), pose[:3, :3].T)  # from world axes to body axes
     covariance = axes @ np.diag(np.square([tilt, tilt, turn, across, across, up])) @ axes.T
     return gtsam.noiseModel.Gaussian.Covariance(0.5 * (covariance + covariance.T))
 
 
 def _upright(up: Array) -> Array:
-    """(4, 4) rotation that turns a direction to the vertical, on the shortest way."""
+    """Return the rotation (4, 4) of a direction to the vertical along the shortest arc."""
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
     angle = np.arctan2(sine, up[2])
