@@ -131,6 +131,7 @@ def test_every_verdict_has_a_reason_and_every_stage_a_time(detections: list[Dete
     assert last.latency_ms["total"] == pytest.approx(sum(last.latency_ms[stage] for stage in stages))
 
 
+@pytest.mark.slow
 def test_the_same_frames_give_the_same_verdicts_bit_for_bit(frames: list[Frame], detections: list[Detection]) -> None:
     again = detector()
     for frame, before in zip(frames, detections, strict=True):
@@ -147,6 +148,7 @@ def test_a_standing_rover_makes_no_keyframes(frames: list[Frame]) -> None:
     assert [found.process(frame).keyframe is not None for frame in still] == [True] + [False] * 19
 
 
+@pytest.mark.slow
 def test_a_clock_that_jumps_back_deletes_nothing(frames: list[Frame]) -> None:
     found = detector()
     for frame in frames[10:40]:
@@ -163,6 +165,7 @@ def pairs(detections: list[Detection]) -> set[tuple[int, int]]:
     return {(c.match_stamp_ns, c.query_stamp_ns) for detection in detections for c in detection.closures}
 
 
+@pytest.mark.slow
 def test_a_recording_replayed_over_one_store_adds_nothing_and_closes_the_same_loops(
     frames: list[Frame], detections: list[Detection], tmp_path: Path
 ) -> None:
@@ -173,6 +176,7 @@ def test_a_recording_replayed_over_one_store_adds_nothing_and_closes_the_same_lo
         found.database.close()
 
 
+@pytest.mark.slow
 def test_a_recording_that_loops_adds_nothing(frames: list[Frame], detections: list[Detection]) -> None:
     found = detector()
     for lap in range(2):
@@ -182,6 +186,7 @@ def test_a_recording_that_loops_adds_nothing(frames: list[Frame], detections: li
         assert pairs(again) <= pairs(detections) and len(pairs(again)) >= 0.9 * len(pairs(detections))
 
 
+@pytest.mark.slow
 def test_a_drive_that_was_interrupted_goes_on_in_its_session(
     frames: list[Frame], detections: list[Detection], tmp_path: Path
 ) -> None:
@@ -202,6 +207,7 @@ def test_a_drive_that_was_interrupted_goes_on_in_its_session(
         assert [c.match_stamp_ns for c in one.closures] == [c.match_stamp_ns for c in other.closures]
 
 
+@pytest.mark.slow
 def test_a_full_disk_costs_the_memory_and_not_the_closures(
     frames: list[Frame], detections: list[Detection], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -23,7 +23,7 @@ from umf_ros.lab.simulation.presets import find_preset
 from umf_ros.lab.simulation.simulator import Simulator
 from umf_ros.sensors.assembly import twists
 
-FAULTS = {"none": "", "baseline 1 %": "baseline is wrong", "turn 1 deg": "are mounted", "clock 20 ms": "clock is"}
+FAULTS = {"none": "", "baseline 1 %": "baseline is wrong", "turn 1 deg": "mounting is wrong", "clock 20 ms": "clock is"}
 """Words of the line that is about a fault."""
 LONGER, TURN_DEG, LATE_NS = 1.01, 1.0, 20_000_000
 SWEEP_NS = 200_000_000
@@ -78,7 +78,7 @@ def main() -> None:
             told = [one.what for one in found if one.severity != "note"]
             is_named = bool(word) and any(word in line for line in told)
             named, alarms = named + is_named, alarms + bool(told and not is_named)
-            unsure += bool(word) and not is_named and any("cannot tell" in one.what for one in found)
+            unsure += bool(word) and not is_named and any("does not determine" in one.what for one in found)
             verdict = "yes" if is_named else "no" if word else "-"
             print(f"| {seed} | {name} | {verdict} | {'; '.join(told) or '-'} |", flush=True)
     count = len(seeds) * (len(FAULTS) - 1)

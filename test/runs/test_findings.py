@@ -183,14 +183,17 @@ def laid_over(scale: float) -> Overlay:
 @pytest.mark.parametrize(
     ("sensors", "said"),
     [
-        (SensorReport(right_contrast=0.4), "the right images are empty: their grey values vary by 0.4"),
-        (SensorReport(left_contrast=5.0), "the left images show little"),
+        (
+            SensorReport(right_contrast=0.4),
+            "the right images are empty: the median standard deviation of grey values is 0",
+        ),
+        (SensorReport(left_contrast=5.0), "the left images have little contrast"),
         (SensorReport(returns=120), "scans have 120 returns in the median"),
         (SensorReport(intensity_max=0.0), "all intensities are 0"),
-        (SensorReport(overlay=laid_over(1.5)), "stereo sees everything 1.5 times as far as the LiDAR"),
+        (SensorReport(overlay=laid_over(1.5)), "stereo depth is 1.5 times that of the LiDAR"),
         (SensorReport(lidar=LIDAR, camera=FINE), "the LiDAR's mounting is off by 9 deg, mostly about y (+9 deg)"),
-        (SensorReport(lidar=LIDAR, camera=LIDAR), "the odometry is not of the body frame"),
-        (SensorReport(forward=np.array([0, 0, 0.9])), "the odometry is not of the body: by its poses"),
+        (SensorReport(lidar=LIDAR, camera=LIDAR), "the odometry is not that of the body: by camera"),
+        (SensorReport(forward=np.array([0, 0, 0.9])), "the odometry is not that of the body: it moves along"),
         (SensorReport(lidar=Disagreement(-0.5, None), camera=FINE), "the LiDAR's clock is about +0.5 s off"),
         (
             SensorReport(lidar=Disagreement(0.4, None), camera=Disagreement(0.4, None)),

@@ -91,7 +91,7 @@ def faults(settings: Settings) -> list[Planted]:
         Planted("wrong extrinsics", ("LiDAR's mounting is off by", "deg"), calibration=_turned),
         Planted("clock offset", ("LiDAR's clock is about +", "s off"), _late({topics.cloud}, CLOCK_OFF_S)),
         Planted("gap rules", ("gap rules exclude every pair",), settings={"loop": {"min_time_gap_s": 3600.0}}),
-        Planted("wrong odometry frame", ("odometry is not of the body",), options=_camera_poses),
+        Planted("wrong odometry frame", ("odometry is not that of the body",), options=_camera_poses),
         Planted("empty right image", ("right images are empty",), empty_right),
         Planted("wrong baseline", ("baseline is wrong",), long_baseline, calibration=_long),
         Planted("all closures pending", ("all closures are pending",), options=_short_odometry),

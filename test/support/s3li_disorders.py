@@ -26,7 +26,7 @@ LENGTHS_M = 40.0, 24.0
 """Of the drive and of its loop."""
 AS_IT_IS = "none taken out"
 SHOWN = ("closures_true", "closures_false", "pose_error_m", "ate_odometry_m", "ate_optimized_m")
-NAMED = {"gps_time": "GPS time", "imu_frame": "odometry is not of the body"}
+NAMED = {"gps_time": "GPS time", "imu_frame": "odometry is not that of the body"}
 """Words of the line that names what is different, by disorder."""
 WORSE = 2.0
 """Times an error of a trajectory, above which a change is not harmless."""

@@ -1,4 +1,4 @@
-"""Lay stereo's points over the LiDAR's scans: what is left tells baseline, mounting and clock apart."""
+"""Baseline, mounting and clock of stereo camera and LiDAR by points that both measure."""
 
 from __future__ import annotations
 
@@ -11,23 +11,28 @@ from numpy.typing import NDArray
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array
 
-PLANE_POINTS, PLANE_M, RANGE_M, PIXEL_PX = 20, 0.01, 0.02, 0.3  # by hand: of surfaces, ranges and disparities
-OVERLAID_FRAMES = 20  # by hand: that deviations are measured from
-WIDEST = np.array([*np.radians((10, 10, 10)), 0.2, 0.5])  # by hand: of what is looked for, rad, share and s
+PLANE_POINTS, PLANE_M, RANGE_M, PIXEL_PX = (
+    20,
+    0.01,
+    0.02,
+    0.3,
+)  # by hand: neighbours of a plane, sigmas of surface, range and disparity
+OVERLAID_FRAMES = 20  # by hand: least frames
+WIDEST = np.array([*np.radians((10, 10, 10)), 0.2, 0.5])  # by hand: prior sigmas, rad, share and s
 ROUNDS = 5  # of reweighting
-STRIPS = 8  # by hand: upright ones of an image
+STRIPS = 8  # by hand: vertical strips of an image
 MEDIAN_OF_NORMAL = 0.6745
 
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """Errors of the LiDAR's calibration by the surfaces that stereo sees, each with its standard deviation.
+    """Errors of the calibration by stereo points on LiDAR surfaces, with their standard deviations.
 
     Attributes:
-        turn_deg: (3,) rotation vector that sets `body_T_lidar` right, body axes.
-        scale: stereo's depth by the LiDAR's.
-        lag_s: to be added to the LiDAR's stamps, by the camera's clock.
-        deviations: (3,) of the turn (deg, its worst axis), of the scale, and of the lag (s).
+        turn_deg: (3,) rotation vector that corrects `body_T_lidar`, body axes.
+        scale: depth of stereo over that of the LiDAR.
+        lag_s: correction of the LiDAR's stamps to the camera's clock.
+        deviations: (3,) standard deviations of turn (deg, largest axis), scale, and lag (s).
     """
 
     turn_deg: Array
@@ -37,16 +42,16 @@ class Overlay:
 
 
 def overlay_equations(frame: Frame, disparity: Array, pixels: Array, chosen: NDArray[np.intp]) -> Array:
-    """Equations (M, 7) of a frame: what a turn (rad), a stretch of stereo and a lag (s) change, what is left, a strip.
+    """Return equations (M, 7) of a frame: derivatives by turn (3, rad), stereo scale and lag (s), residual, and strip.
 
-    A point of stereo has to lie in the plane around the LiDAR's point that is seen at its pixel. Each row is weighed
-    by the deviation of its distance; the strip is that of the image.
+    A stereo point must lie in the plane around the LiDAR point at its pixel. Each row is divided by the standard
+    deviation of this distance; the last column is the vertical strip of the image.
 
     Args:
         frame: with points and motion.
         disparity: (M,) px.
         pixels: (M, 2) of the left image.
-        chosen: (M,) rows of the scan's points that are seen there.
+        chosen: (M,) rows of the scan's points at these pixels.
     """
     assert frame.points is not None
     camera, cloud = frame.camera, frame.points.astype(float)
@@ -58,7 +63,7 @@ def overlay_equations(frame: Frame, disparity: Array, pixels: Array, chosen: NDA
     rays = np.column_stack([across, down, np.ones(len(pixels))]) @ frame.body_T_camera[:3, :3].T
     depth = (points - frame.body_T_camera[:3, 3]) @ frame.body_T_camera[:3, 2]
     pixel_m = depth**2 / (camera.fx * camera.baseline)
-    nearer = pixel_m * (disparity - camera.fx * camera.baseline / depth)  # without a bias of 1 / disparity
+    nearer = pixel_m * (disparity - camera.fx * camera.baseline / depth)  # linear in the disparity, so unbiased
     rates = np.zeros(6) if frame.motion is None else frame.motion.rates
     moved = rates[:3] + np.cross(rates[3:], points)
     levers = np.cross(points - frame.body_T_lidar[:3, 3], normals)
@@ -69,10 +74,10 @@ def overlay_equations(frame: Frame, disparity: Array, pixels: Array, chosen: NDA
 
 
 def lay_over(equations: list[Array]) -> Overlay | None:
-    """Solve the equations of many frames robustly; None of too few.
+    """Solve the equations of many frames robustly; return None for too few frames.
 
-    The deviations follow from how frames differ, and strips of the image: points of one of them err alike. They grow
-    where surfaces are rougher, or disparities noisier, than was reckoned with: such errors are seldom of mean zero.
+    The standard deviations are those between frames and between strips of the image, within which errors are correlated
+    (cluster-robust). They are enlarged if the residuals exceed the assumed noise.
     """
     if len(equations) < OVERLAID_FRAMES:
         return None

@@ -1,4 +1,4 @@
-"""Check light, clocks, mountings and baseline of a recording by what its sensors see."""
+"""Check of exposure, clocks, mountings and baseline of a recording by its own measurements."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ SCAN_CELL_M, SCAN_REACH_M = 0.4, 1.0  # by hand: consecutive scans, a quarter of
 CELL_MASK = 2**21 - 1  # three coordinates in one number: a scan is far narrower than two million cells
 MIN_SCAN_POINTS = 200  # by hand: below, consecutive scans are not registered
 CORNERS, CORNER_QUALITY, CORNER_SPACING, CORNER_WINDOW, CORNER_LEVELS = 300, 0.01, 8, (21, 21), 4  # by hand
-MIN_CORNERS = 30  # by hand: inliers that make an essential matrix believed
-MIN_PAIRS = 30  # by hand: of consecutive frames
-LAGS_S = np.arange(-1.5, 1.51, 0.05)  # by hand: a clock further off than this makes no frames
-NOISE_RAD = 0.005  # measured on simulated drives: of the rotation between consecutive scans
-NOISE_DIRECTION = 0.3  # by hand: of the direction of a quarter of a metre of way
+MIN_CORNERS = 30  # by hand: least inliers of an essential matrix
+MIN_PAIRS = 30  # by hand: least pairs of consecutive frames
+LAGS_S = np.arange(-1.5, 1.51, 0.05)  # by hand: with a larger offset there are no frames
+NOISE_RAD = 0.005  # measured on simulated drives: sigma of the rotation between consecutive scans
+NOISE_DIRECTION = 0.3  # by hand: sigma of the direction of a quarter of a metre
 ROUNDS = 5  # of reweighting
-KNOWN = 0.02  # by hand: share of the second direction of motion below which the mounting is not observable
-BETTER = 0.75  # by hand: residual at another lag, of that without any, below which a clock is called wrong
-CONTRAST = 0.6  # by hand: residual at the best lag, of that at a usual one, above which nothing is said
+KNOWN = 0.02  # by hand: least share of the second direction of motion for an observable mounting
+BETTER = 0.75  # by hand: residual at another lag over that at lag 0, below which a clock is reported
+CONTRAST = 0.6  # by hand: residual at the best lag over the median one, above which the lag is unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +40,8 @@ class Step:
 
     Attributes:
         start_ns, end_ns: their stamps.
-        turn: (3,) rotation vector, rad, body axes as the calibration has them.
-        shift: (3,) m, or a direction of length 1 where one camera cannot tell the length; likewise.
+        turn: (3,) rotation vector, rad, about the body axes of the calibration.
+        shift: (3,) m in these axes, or a unit vector for a single camera, which measures no length.
     """
 
     start_ns: int
@@ -52,12 +52,12 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
-    """How a sensor's motion differs from the odometry's.
+    """Difference between the motion of a sensor and that of the odometry.
 
     Attributes:
-        lag_s: to be added to the sensor's stamps.
-        mounting_deg: (3,) rotation vector that turns the sensor's motion into the odometry's, body axes; None where
-            the motion does not tell.
+        lag_s: correction of the sensor's stamps.
+        mounting_deg: (3,) rotation vector from the sensor's motion to the odometry's, body axes; None if it is not
+            observable.
     """
 
     lag_s: float
@@ -65,10 +65,10 @@ class Disagreement:
 
 
 def as_measured(frame: Frame) -> tuple[Points, float]:
-    """The scan (N, 3) m with the motion during it put back, and its mean moment, s after the frame's stamp.
+    """Return the scan (N, 3) m as measured, with its motion distortion, and its mean time, s after the frame's stamp.
 
-    That motion was removed by the very odometry, clock and mounting that are in question: what was removed wrongly
-    would look like motion that agrees with them. A point counts by its lever, as it does where scans are aligned.
+    The distortion was removed by the odometry, clock and mounting under test, which biases the motion between scans
+    towards them. The mean is weighted by squared range, as the points are in an alignment of rotations.
     """
     assert frame.points is not None
     if frame.motion is None or not len(frame.points):
@@ -77,14 +77,14 @@ def as_measured(frame: Frame) -> tuple[Points, float]:
     turns = Rotation.from_rotvec(-moments[:, None] * frame.motion.rates[3:])
     measured = turns.apply(frame.points - moments[:, None] * frame.motion.rates[:3])
     cell = np.floor(frame.points / SCAN_CELL_M).astype(np.int64) & CELL_MASK
-    # those that are left when points are thinned before they are aligned
+    # the points that remain after the alignment thins them
     thinned = np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)[1]
     levers: Array = np.square(frame.points[thinned].astype(float)).sum(axis=1)
     return measured.astype(np.float32), float(np.average(moments[thinned], weights=levers + 1e-9))
 
 
 def scan_step(earlier: Frame, later: Frame) -> Step | None:
-    """The motion of the body between two scans; None where they do not align."""
+    """Return the motion of the body between two scans; None if they do not align."""
     (before, before_s), (after, after_s) = as_measured(earlier), as_measured(later)
     if min(len(before), len(after)) < MIN_SCAN_POINTS:
         return None
@@ -101,7 +101,7 @@ def scan_step(earlier: Frame, later: Frame) -> Step | None:
 
 
 def view_step(earlier: Frame, later: Frame) -> Step | None:
-    """The motion of the body between two left images, its shift a direction; None where they tell none."""
+    """Return the motion of the body between two left images, its shift as a direction; None if it is unknown."""
     assert earlier.left is not None and later.left is not None
     assert earlier.image_stamp_ns is not None and later.image_stamp_ns is not None
     pairs = _tracked(earlier.left, later.left)
@@ -132,14 +132,14 @@ def _tracked(earlier: Image, later: Image) -> tuple[Any, Any] | None:
 
 
 def compare_motion(steps: list[Step], odometry: Trajectory) -> Disagreement | None:
-    """Clock and mounting of a sensor against the odometry; None where the motion does not tell.
+    """Return clock and mounting of a sensor relative to the odometry; None if they are not observable.
 
-    Every lag is tried; at each the one rotation that turns all of the sensor's motion into the odometry's is found,
-    from turns and directions of the path together. The turns that remain say how well the lag fits.
+    For each lag, one rotation from the sensor's motion to the odometry's is estimated from rotations and directions of
+    motion. The lag with the smallest residual rotations is chosen.
 
     Args:
         steps: motion of the sensor.
-        odometry: poses of the body, as stated.
+        odometry: poses of the body.
     """
     if len(steps) < MIN_PAIRS or len(odometry) < MIN_PAIRS:
         return None
@@ -162,7 +162,7 @@ def compare_motion(steps: list[Step], odometry: Trajectory) -> Disagreement | No
     sizes = [size for size, *_ in tried]
     in_step = min(range(len(tried)), key=lambda at: abs(tried[at][1]))
     best = int(np.argmin(sizes))
-    if sizes[best] > BETTER * sizes[in_step]:  # a clock is right until the motion clearly says otherwise
+    if sizes[best] > BETTER * sizes[in_step]:  # without clear evidence the clock counts as right
         best = in_step
     residual, lag, rotation, known = tried[best]
     if residual > CONTRAST * float(np.median(sizes)):
@@ -174,19 +174,19 @@ def compare_motion(steps: list[Step], odometry: Trajectory) -> Disagreement | No
 
 
 def _spread(residuals: Array) -> float:
-    """Size (rad) of residuals (N, 3): the mean of the axes by their product, for one is often far better known."""
+    """Return the size (rad) of residuals (N, 3): the geometric mean of the axes, whose uncertainties differ widely."""
     return float(np.exp(np.log(np.median(np.abs(residuals), axis=0) + 1e-9).mean()))
 
 
 def _lowest(three: list[float]) -> float:
-    """Where a parabola through three values at -1, 0 and 1 is lowest, the middle one being the least of them."""
+    """Return the minimum of a parabola through three values at -1, 0 and 1, of which the middle one is the least."""
     before, middle, after = np.log(three)
     bend = before - 2 * middle + after
     return float((before - after) / (2 * bend)) if bend > 0 else 0.0
 
 
 def _one_rotation(turns: Array, stated: Array, ways: Array, stated_ways: Array) -> tuple[Array, Array, bool]:
-    """Rotation (3, 3) that turns (N, 3) into stated (N, 3), robustly; the (N, 3) that is left; whether it is known."""
+    """Return the robust rotation (3, 3) of (N, 3) to stated (N, 3), residuals (N, 3), and whether it is observable."""
     weights = np.ones(len(turns))
     for _ in range(ROUNDS):
         weighed = weights[:, None]
@@ -202,26 +202,26 @@ def _one_rotation(turns: Array, stated: Array, ways: Array, stated_ways: Array) 
 
 def _directions(vectors: Array) -> Array:
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.where(length > 0.02, vectors / np.maximum(length, 1e-9), 0.0)  # none while it stands
+    return np.where(length > 0.02, vectors / np.maximum(length, 1e-9), 0.0)  # zero at rest
 
 
-MIN_STEP_S, MAX_STEP_S = 0.18, 1.0  # between frames whose motion is compared, by hand
+MIN_STEP_S, MAX_STEP_S = 0.18, 1.0  # by hand: between frames whose motion is compared
 MAX_STEPS = 150  # by hand: bounds the time
-MOVES_M = 0.03  # by hand: a parked rover says nothing of its clocks
+MOVES_M = 0.03  # by hand: a parked rover carries no information on clocks
 DEPTH_EVERY, DEPTH_FRAMES, DEPTH_POINTS = 4, 60, 400  # by hand: bounds the time
-DEPTH_RANGE_M = (2.0, 15.0)  # by hand: where a third of a pixel is a few per cent
+DEPTH_RANGE_M = (2.0, 15.0)  # by hand: where a third of a pixel is a few per cent of the depth
 
 
 @dataclass(frozen=True, slots=True)
 class SensorReport:
-    """Measurements of a recording; NaN and None where there was nothing to measure them on.
+    """Measurements of a recording; NaN or None if they are unknown.
 
     Attributes:
         left_contrast, right_contrast: median standard deviation of an image's grey values.
         returns: median number of a scan's returns.
         intensity_max: largest intensity; NaN where the driver sends none.
-        overlay: baseline, mounting and clock by stereo's points that are laid over the scans.
-        lidar, camera: how their motion differs from the odometry's.
+        overlay: baseline, mounting and clock by stereo points on the scans.
+        lidar, camera: their motion relative to the odometry.
         forward: (3,) mean direction of motion by odometry, body axes.
     """
 
@@ -236,7 +236,7 @@ class SensorReport:
 
 
 class SensorCheck:
-    """Looks at the frames of a recording as they pass, for a report at the end."""
+    """Check of the frames of a recording as they pass, with a report at the end."""
 
     def __init__(self) -> None:
         self._contrasts: tuple[list[float], list[float]] = [], []
@@ -249,7 +249,7 @@ class SensorCheck:
         self._view_steps: list[Step] = []
 
     def take(self, frame: Frame) -> None:
-        """Look at one frame, in the order of their stamps."""
+        """Add one frame, in the order of the stamps."""
         self._frames += 1
         self._look(frame)
         if self._frames % DEPTH_EVERY == 1:
@@ -262,7 +262,7 @@ class SensorCheck:
         self._last = frame
 
     def report(self, odometry: Trajectory | None) -> SensorReport:
-        """Hold the measurements against the odometry as it was recorded."""
+        """Return the measurements, compared with the odometry as recorded."""
         left, right, returns = (_median(values) for values in (*self._contrasts, self._returns))
         found = SensorReport(left, right, returns, self._intensity_max, lay_over(self._overlaid))
         if odometry is None:
@@ -281,7 +281,7 @@ class SensorCheck:
                 self._intensity_max = float(np.fmax(self._intensity_max, frame.intensity.max()))
 
     def compare_depths(self, frame: Frame) -> None:
-        """Lay stereo's points over the scan, where both look."""
+        """Compare stereo disparities with the scan in the common field of view."""
         if frame.left is None or frame.right is None or frame.points is None or len(self._overlaid) >= DEPTH_FRAMES:
             return
         camera = frame.camera
@@ -310,7 +310,7 @@ class SensorCheck:
 
 
 def _forward(odometry: Trajectory) -> Array | None:
-    """Mean direction of motion, body axes, from poses half a second apart or more."""
+    """Return the mean direction of motion, body axes, from poses at least half a second apart."""
     if len(odometry) < 2:
         return None
     kept = np.searchsorted(odometry.stamps_ns, np.arange(odometry.stamps_ns[0], odometry.stamps_ns[-1], 500_000_000))
@@ -326,30 +326,31 @@ def _median(values: list[float]) -> float:
 
 
 BLANK, DIM = 3.0, 8.0
-"""Grey values, by hand: standard deviations of an image that shows nothing, and next to nothing."""
+"""Grey values, by hand: largest standard deviations of an empty image, and of one with little contrast."""
 FEW_RETURNS = 500
-"""Of a scan, by hand: a place takes more to be told by."""
+"""By hand: largest number of returns of a scan that is too sparse for place recognition."""
 LAG_S = 0.1
-"""By hand: twice the step that lags are tried in."""
+"""By hand: least lag that is reported, twice the step of the search."""
 MOUNTING_DEG = 6.0
-"""Measured on simulated drives: right mountings come out within 3.3 deg, the worst about the vertical."""
+"""Least rotation that is reported (*measured* on simulated drives: errors of right mountings reach 3.3 deg, the largest
+about the vertical)."""
 FINE_DEG, FINE_SCALE, FINE_S = 0.5, 0.006, 0.01
-"""Measured on simulated drives: errors by stereo over the scans stay below half of these with a right calibration."""
+"""Least errors by stereo that are reported (*measured* on simulated drives: those of right calibrations reach half)."""
 SURE = 3.0
-"""Standard deviations, by hand."""
+"""By hand: least standard deviations of an error by stereo that is reported."""
 SAME_DEG = 5.0
-"""By hand: two sensors that differ from the odometry alike: it is the odometry."""
+"""By hand: largest difference of two sensors' rotations that is attributed to the odometry."""
 ACROSS = 0.5
-"""Share of the motion, by hand: a body drives along its x, or its y where it can."""
+"""By hand: least share of the motion along z for which the odometry is not that of the body."""
 _SENSORS = {"lidar": "LiDAR", "camera": "camera"}
 
 
 def about_sensors(seen: SensorReport) -> Iterator[Advice]:
-    """Findings about light, returns, baseline, clocks and mountings."""
+    """Yield findings about exposure, returns, baseline, clocks and mountings."""
     yield from _measurements(seen)
     if seen.forward is not None and abs(seen.forward[2]) >= max(ACROSS, np.abs(seen.forward[:2]).max()):
-        what = "the odometry is not of the body: by its poses the way goes along the body's z axis, and z is up"
-        remedy = "--odometry-frame camera, imu or lidar says whose poses the file holds (of the camera z looks ahead)"
+        what = "the odometry is not that of the body: it moves along the body's z axis, which is up"
+        remedy = "name the frame of the poses: --odometry-frame camera (z forward), imu or lidar"
         yield Advice("fault", what, remedy)
     known = {name: one for name in _SENSORS if (one := getattr(seen, name)) is not None}
     by_motion = [*_clocks({name: one.lag_s for name, one in known.items()})]
@@ -360,71 +361,70 @@ def about_sensors(seen: SensorReport) -> Iterator[Advice]:
 
 
 def _overlaid(overlay: Overlay, is_known: bool) -> Iterator[Advice]:
-    """The error that is largest for what it spoils, as it looks like a little of the others; unless it `is_known`."""
+    """Yield the largest error by its limit, as it causes apparent errors of the others; unless it `is_known`."""
     turn, scale, units = overlay.turn_deg, overlay.scale, np.array([FINE_DEG, FINE_SCALE, FINE_S])
     sizes = np.abs(np.array([float(np.linalg.norm(turn)), scale - 1, overlay.lag_s])) / units
     bounds, worst = SURE * overlay.deviations / units, int(sizes.argmax())
-    seen = "by the ground that both see"
+    seen = "by stereo and LiDAR on the same surfaces"
     if sizes[worst] <= max(bounds[worst], 1):
         pass
     elif worst == 1:
-        what = f"stereo sees everything {scale:.3g} times as far as the LiDAR: the baseline is wrong by that factor"
-        remedy = f"baseline of the calibration, or P[3] of the right camera_info: divide by {scale:.3f}"
+        what = f"stereo depth is {scale:.3g} times that of the LiDAR: the baseline is wrong by this factor"
+        remedy = f"divide the baseline of the calibration, or P[3] of the right camera_info, by {scale:.3f}"
         yield Advice("fault", what, remedy)
     elif worst == 0 and not is_known:
-        what = f"{seen}, LiDAR and camera are mounted otherwise than stated: {_turn(turn)} sets the LiDAR right"
-        yield Advice("warning", what, "body_T_lidar or body_T_camera of the calibration")
+        what = f"{seen}, the mounting is wrong: rotating the LiDAR by {_turn(turn)} corrects it"
+        yield Advice("warning", what, "correct body_T_lidar or body_T_camera of the calibration")
     elif not is_known:
         what = f"{seen}, the LiDAR's clock is about {-overlay.lag_s:+.3f} s off the camera's"
-        yield Advice("warning", what, "the stamps of their drivers (PTP, or a constant): no parameter corrects them")
+        yield Advice("warning", what, "correct the stamps in the drivers (PTP, or a constant): no parameter does")
     for bound, name in zip(bounds, ("mounting to 1 deg", "baseline to 1 %", "clock to 20 ms"), strict=True):
         if bound > 2:
-            what = f"the recording cannot tell the {name}"
-            yield Advice("note", what, "a longer drive past rocks and with turns may")
+            what = f"the recording does not determine the {name}"
+            yield Advice("note", what, "record a longer drive with turns past rocks")
 
 
 def _measurements(seen: SensorReport) -> Iterator[Advice]:
     for name, contrast in (("left", seen.left_contrast), ("right", seen.right_contrast)):
-        vary = f"their grey values vary by {contrast:.1f} in the median"
+        vary = f"the median standard deviation of grey values is {contrast:.1f}"
         if contrast < BLANK:
-            remedy = f"is the camera covered, or the topic another one's? topics.{name}_image"
+            remedy = f"check that the camera is not covered, and topics.{name}_image"
             yield Advice("fault", f"the {name} images are empty: {vary}", remedy)
         elif contrast < DIM:
-            yield Advice("warning", f"the {name} images show little: {vary}", "exposure and gain of the camera")
+            yield Advice("warning", f"the {name} images have little contrast: {vary}", "correct exposure and gain")
     if seen.returns < FEW_RETURNS:
-        remedy = "places take a few thousand: merge scans, or see min_intensity and max_height_m of the calibration"
+        remedy = "a place needs some thousands: merge scans, or check min_intensity and max_height_m of the calibration"
         yield Advice("warning", f"scans have {seen.returns:.0f} returns in the median", remedy)
     if seen.intensity_max == 0:
-        yield Advice("warning", "all intensities are 0: the descriptor does without them", "a field named intensity")
+        yield Advice("warning", "all intensities are 0, so the descriptor has none", "publish a field named intensity")
 
 
 def _clocks(lags: dict[str, float]) -> Iterator[Advice]:
     off = {name: lag for name, lag in lags.items() if abs(lag) >= LAG_S}
     if off and len(lags) == 2 and abs(lags["lidar"] - lags["camera"]) < LAG_S:
         what = f"the odometry's clock is about {lags['lidar']:+.1f} s off those of camera and LiDAR"
-        yield Advice("fault", what, "correct its stamps: closures and scans are placed by it")
+        yield Advice("fault", what, "correct its stamps: frames take their poses from it")
         return
     for name, lag in off.items():
         what = f"the {_SENSORS[name]}'s clock is about {-lag:+.1f} s off the odometry's, by its motion"
-        yield Advice("fault", what, "the stamps of its driver (PTP, or a constant): no parameter corrects them")
+        yield Advice("fault", what, "correct the stamps in its driver (PTP, or a constant): no parameter does")
 
 
 def _mountings(known: dict[str, Array]) -> Iterator[Advice]:
     off = {name: turn for name, turn in known.items() if np.linalg.norm(turn) > MOUNTING_DEG}
     if len(off) == 2 and np.linalg.norm(off["lidar"] - off["camera"]) < SAME_DEG:
         turned = _turn(off["lidar"])
-        what = f"the odometry is not of the body frame: camera and LiDAR both say it is turned by {turned}"
-        remedy = "--odometry-frame camera, imu or lidar says whose poses the file holds; a topic must be of the body"
+        what = f"the odometry is not that of the body: by camera and LiDAR it is rotated by {turned}"
+        remedy = "name the frame of the poses (--odometry-frame camera, imu or lidar); a topic must be that of the body"
         yield Advice("fault", what, remedy)
         return
     for name, turn in off.items():
-        off_by = f"the {_SENSORS[name]}'s mounting is off by {_turn(turn)}"
-        what = f"{off_by}: so its motion says, held against the odometry's"
-        yield Advice("fault", what, f"body_T_{name} of the calibration")
+        what = f"the {_SENSORS[name]}'s mounting is off by {_turn(turn)}, by its motion and the odometry"
+        yield Advice("fault", what, f"correct body_T_{name} of the calibration")
 
 
 def _turn(mounting_deg: Array) -> str:
-    """As "10 deg about y"."""
+    """Return a rotation in words, such as "10 deg, mostly about y"."""
     axis = int(np.abs(mounting_deg).argmax())
     digits = 0 if np.linalg.norm(mounting_deg) > SAME_DEG else 1
     size, along = np.linalg.norm(mounting_deg), mounting_deg[axis]

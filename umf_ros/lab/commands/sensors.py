@@ -22,7 +22,7 @@ def command(
 ) -> None:
     """Check the sensors of a recording, and replay it with both, with the LiDAR alone and with the camera alone.
 
-    First come faults of light, clocks, mountings and baseline, and what the recording cannot tell of them.
+    Faults of exposure, clocks, mountings and baseline are printed first, then notes on what cannot be measured.
     Without a recording, a drive is simulated that passes a stretch where the LiDAR sees nothing, even ground, and one
     where the camera sees nothing, after sunset. Takes some minutes.
     """
