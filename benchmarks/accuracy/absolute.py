@@ -171,7 +171,7 @@ def measure(seed: int, quick: bool) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=FIRST_SEED)
-    parser.add_argument("--quick", action="store_true", help="half a kilometre")
+    parser.add_argument("--quick", action="store_true", help="0.5 km instead of 1.5 km")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     figures = measure(arguments.seed, arguments.quick)

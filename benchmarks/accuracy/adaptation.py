@@ -180,9 +180,11 @@ def run_rover(rover: Rover, seed: int, size: Size, work: Path) -> dict[str, Any]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="one rover, shorter drives")
-    parser.add_argument("--seed", type=int, default=TEST.start + 400, help="of the first world; each rover takes two")
-    parser.add_argument("--work", type=Path, default=Path("results/adaptation"), help="where recordings are kept")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument(
+        "--seed", type=int, default=TEST.start + 400, help="seed of the first world; each rover takes two"
+    )
+    parser.add_argument("--work", type=Path, default=Path("results/adaptation"), help="folder of the recordings")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     arguments = parser.parse_args()
     size = Size(40.0, QUICK) if arguments.quick else Size(60.0, FULL)
     rovers = []

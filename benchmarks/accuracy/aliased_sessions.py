@@ -28,8 +28,8 @@ CASES: tuple[tuple[Kind, float], ...] = (("groups", 0.3), ("near", 0.3), ("group
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="two worlds")
-    parser.add_argument("--seed", type=int, default=TEST.start + 1, help="of the first world")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--seed", type=int, default=TEST.start + 1, help="seed of the first world")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     arguments = parser.parse_args()
     found = []
     for seed in range(arguments.seed, arguments.seed + (2 if arguments.quick else 10)):

@@ -64,7 +64,7 @@ def planted(frames: list[Frame], simulator: Simulator, name: str, axis: int) -> 
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="20001:20006", help="of the drives, as first:last+1")
+    parser.add_argument("--seeds", default="20001:20006", help="seeds of the drives, as first:last+1")
     seeds = range(*map(int, parser.parse_args().seeds.split(":")))
     named = unsure = alarms = 0
     print("| seed | planted | named | said |\n|---|---|---|---|")

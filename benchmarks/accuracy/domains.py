@@ -57,7 +57,7 @@ from support.domain_outcomes import Outcome, summary
 def main(
     quick: Annotated[bool, typer.Option(help="fewer scans of fewer worlds")] = False,
     seed: Annotated[int, typer.Option(help="other worlds; from 10000 on those of validation")] = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
     jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1,
     folder: Annotated[Path | None, typer.Option(help="keeps the simulated scans for the next time")] = None,
     only: Annotated[str, typer.Option(help="domains whose name contains this")] = "",

@@ -278,8 +278,8 @@ def measure(folder: MapFolder, places: int, seed: int) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--map", type=Path, help="a map whose recordings are there; default: four simulated drives")
-    parser.add_argument("--seed", type=int, default=10001, help="world of the simulated drives, and all that is random")
+    parser.add_argument("--map", type=Path, help="map with its recordings; default: four simulated drives")
+    parser.add_argument("--seed", type=int, default=10001, help="seed of the worlds and of all random draws")
     parser.add_argument("--work", type=Path, default=Path("data/fleet"), help="folder of the simulated drives")
     parser.add_argument("--quick", action="store_true", help="an archive of 10,000 places, drives of 40 s")
     given = parser.parse_args()

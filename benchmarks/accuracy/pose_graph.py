@@ -420,11 +420,11 @@ def equality(worlds: list[GraphWorld]) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="*", type=Path, help="g2o files to try as well")
+    parser.add_argument("files", nargs="*", type=Path, help="further g2o files")
     parser.add_argument("--quick", action="store_true", help="fewer and smaller graphs")
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help="seed of the first generated graph")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="worlds that are driven at a time")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="worlds in parallel")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     arguments = parser.parse_args()
     # the cost first, while no other world is driven
     costs = cost(arguments.seed)

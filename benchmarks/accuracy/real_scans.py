@@ -41,7 +41,7 @@ def main(
     sample: Annotated[int, typer.Option(help="pairs drawn where there is no pairs.csv")] = 200,
     apart: Annotated[int, typer.Option(help="scans between the two of such a pair, at least")] = 20,
     crop: Annotated[float, typer.Option(help="keep what lies at most this far to either side, deg")] = 180.0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
 ) -> None:
     """Verify the pairs of a folder and compare with what is known."""
     console = Console()

@@ -107,7 +107,7 @@ def other_places(worlds: int, quick: bool) -> Iterator[tuple[int, Frame]]:
 def main(
     bags: Annotated[list[Path], typer.Argument(help="recordings with ground truth")],
     quick: Annotated[bool, typer.Option(help="two other worlds, and only the smallest and the largest crowd")] = False,
-    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
     only: Annotated[str, typer.Option(help="methods whose name contains this")] = "",
 ) -> None:
     """Share of revisits closed beside ever more places of other worlds."""

@@ -253,11 +253,11 @@ def seeds(first: int | None) -> Iterator[int]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="three sessions of 40 s, four cold starts")
-    parser.add_argument("--seed", type=int, help="one world alone")
+    parser.add_argument("--seed", type=int, help="seed of a single world")
     parser.add_argument(
         "--work", type=Path, default=Path("results/sessions"), help="where recordings and maps are kept"
     )
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     arguments = parser.parse_args()
     size = QUICK if arguments.quick else FULL
     kind = "quick" if arguments.quick else "full"

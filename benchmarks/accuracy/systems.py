@@ -156,7 +156,7 @@ def main(
     bags: Annotated[list[Path], typer.Argument(help="recordings with truth in them")],
     systems: Annotated[str, typer.Option(help="which, by comma; empty: all")] = "",
     peers: Annotated[Path, typer.Option(help="environment of the peers")] = Path("runs/peers"),
-    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
 ) -> None:
     """Run all systems on all recordings."""
     console = Console(width=140)

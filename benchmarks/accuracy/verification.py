@@ -67,7 +67,7 @@ class World:
 def main(
     quick: Annotated[bool, typer.Option(help="one world")] = False,
     seed: Annotated[int, typer.Option(help="other worlds")] = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
     count: Annotated[int, typer.Option("--worlds", help="how many worlds")] = 10,
     drives: Annotated[Path | None, typer.Option(help="folder that keeps simulated drives for the next time")] = None,
     weights: Annotated[str, typer.Option(help="safetensors; empty: the shipped ones")] = "",

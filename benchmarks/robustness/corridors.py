@@ -37,7 +37,7 @@ def main(
     worlds: Annotated[int, typer.Option(help="passages of each kind, sensor, mount and relief", min=1)] = 1,
     jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1,
     only: Annotated[str, typer.Option(help="passages whose name contains this")] = "",
-    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
 ) -> None:
     """Verify all pairs of every passage and compare with the truth."""
     console = Console()

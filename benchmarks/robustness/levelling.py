@@ -42,7 +42,7 @@ TILTED_DEG = (0.0, 8.0, 15.0, 20.0, 28.0)
 def main(
     seed: Annotated[int, typer.Option(help="of the first facade; 10000 to 19999 are for development")] = TEST.start,
     scenes: Annotated[int, typer.Option(help="facades", min=1)] = 10,
-    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
 ) -> None:
     """Print one line for each facade and each tilt."""
     console = Console()

@@ -31,7 +31,7 @@ def main(
     starts: Annotated[int, typer.Option(help="of the replay and of each node")] = 100,
     busy: Annotated[int, typer.Option(help="processes that compute beside them")] = 3,
     seed: Annotated[int, typer.Option(help="of the recording")] = 20007,
-    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
 ) -> None:
     """Count hangs and failures of many starts."""
     figures: dict[str, int] = {}

@@ -1,1 +1,1 @@
-"""Subcommands of `umf` that make, play or judge; heavy imports stay inside the functions."""
+"""Subcommands of `umf` for simulation, training and evaluation; heavy imports stay inside the functions."""

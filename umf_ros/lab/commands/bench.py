@@ -22,7 +22,7 @@ def places(
     run: Annotated[
         Path | None, typer.Option(help="Repeat the descriptors of this run with noise; default: random drives.")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="150,000 places in place of a million.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="150,000 places instead of a million.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the descriptors.")] = 0,
 ) -> None:
     """Measure search among 1,000, 100,000 and a million places: time, recall, memory and disk.

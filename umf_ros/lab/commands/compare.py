@@ -1,4 +1,4 @@
-"""`umf compare` and `umf explain`: whether two views show the same place, and a picture of why."""
+"""`umf compare` and `umf explain`: comparison of two views, and a picture of the decision."""
 
 from __future__ import annotations
 
@@ -30,17 +30,19 @@ def command(
     match_right: Image = None,
     query_left: Image = None,
     query_right: Image = None,
-    pairs: Annotated[Path | None, typer.Option("--list", help="CSV of pairs, paths relative to it.")] = None,
-    out: Annotated[Path | None, typer.Option(help="CSV of verdicts about the list.")] = None,
+    pairs: Annotated[Path | None, typer.Option("--list", help="CSV file of pairs; paths are relative to it.")] = None,
+    out: Annotated[Path | None, typer.Option(help="CSV file for the verdicts on the list.")] = None,
     calibration: Annotated[Path | None, typer.Option(help="Calibration file, or name of a data set.")] = None,
-    bin_columns: Annotated[int, typer.Option(min=0, max=64, help="Numbers per point of a .bin; 0: 4 or 3.")] = 0,
+    bin_columns: Annotated[
+        int, typer.Option(min=0, max=64, help="Numbers per point of a .bin file; 0: 4, else 3.")
+    ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
     config: ConfigPath = None,
     dataset: DatasetName = "auto",
     embedder: EmbedderName = None,
     weights: WeightsPath = None,
 ) -> None:
-    """Tell whether two views show the same place, and how the second lies in the first.
+    """Decide whether two views show the same place, and estimate their relative pose.
 
     A view is a scan, an image (left, and right for its depth), or both; or a frame of a recording, BAG@STAMP.
     STAMP is in ns, or in seconds from the recording's start.
@@ -85,7 +87,7 @@ def command(
 
 
 def _check_named(match: str | Path | None, query: str | Path | None, out: Path | None) -> None:
-    """Refuse impossible arguments before the slow imports."""
+    """Refuse invalid arguments before the slow imports."""
     if out is not None:
         raise ConfigError("--out VERDICTS.csv goes with --list PAIRS.csv; one pair is printed (--json)")
     for view, name in ((match, "MATCH"), (query, "QUERY")):
@@ -130,7 +132,7 @@ def _compare_list(comparer: Comparer, asked: list[Pair], base: Path, out: Path, 
 
 
 def _result(comparer: Comparer, pair: Pair) -> tuple[Row, str]:
-    """Return the row of a pair, and the reason where it could not be compared."""
+    """Return the row of a pair, and the reason if it could not be compared."""
     from umf_ros.lab.evaluation.comparison import result_row
 
     try:
@@ -162,14 +164,14 @@ def _show(row: Row, as_json: bool) -> None:
 def explain(
     bag: BagPath,
     query: Annotated[str, typer.Argument(help="The later moment: stamp in ns, or seconds from the start.")],
-    match: Annotated[str, typer.Argument(help="The earlier moment, likewise.")],
+    match: Annotated[str, typer.Argument(help="The earlier moment, in the same units.")],
     out: Annotated[Path, typer.Option(help="Picture to write.")] = Path("explanation.png"),
     config: ConfigPath = None,
     dataset: DatasetName = "auto",
     embedder: EmbedderName = None,
     weights: WeightsPath = None,
 ) -> None:
-    """Show both images with their matching features, both scans aligned, and the decision's numbers."""
+    """Draw both images with their matches, the aligned scans, and the numbers of the decision."""
     from rich.console import Console
 
     from umf_ros.bags.frames import FrameReader

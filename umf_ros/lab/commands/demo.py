@@ -1,4 +1,4 @@
-"""`umf demo` and `umf play`: a recording on the live topics, with or without the nodes that listen."""
+"""`umf demo` and `umf play`: play a recording on the live topics, with or without the nodes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from umf_ros.core.errors import UmfError
 
 
 def command(
-    seed: Annotated[int, typer.Option(min=0, help="World and traverse.")] = 1,
-    out: Annotated[Path, typer.Option(help="Where results/<timestamp> goes.")] = Path("results"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of world and traverse.")] = 1,
+    out: Annotated[Path, typer.Option(help="Parent folder of results/<timestamp>.")] = Path("results"),
     bag: Annotated[Path | None, typer.Option(help="Play this recording instead of simulating one.")] = None,
     rate: Annotated[float, typer.Option(min=0.1, max=10, help="Speed of the player.")] = 1.0,
     duration: Annotated[
@@ -50,13 +50,13 @@ def command(
 
 def play(
     bag: BagPath,
-    rate: Annotated[float, typer.Option(min=0.01, max=100, help="Speed; 1 is that of the recording.")] = 1.0,
+    rate: Annotated[float, typer.Option(min=0.01, max=100, help="Speed as a multiple of the recording's.")] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="Start again at the end, until Ctrl-C.")] = False,
     wait_for_subscribers: Annotated[
-        bool, typer.Option("--wait-for-subscribers", help="Start when images and scans are wanted.")
+        bool, typer.Option("--wait-for-subscribers", help="Start when images and scans have subscribers.")
     ] = False,
 ) -> None:
-    """Publish a recording on its topics, with /clock, at its own pace."""
+    """Publish a recording on its topics, with /clock, at its own speed."""
     check_files(bag)
 
     import importlib.util

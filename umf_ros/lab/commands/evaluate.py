@@ -1,4 +1,4 @@
-"""`umf evaluate`: recall, precision, rerankers, lost modalities and cost."""
+"""`umf evaluate`: recall, precision, reranking, missing modalities and cost."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OpenRecording:
-    """A recording with its truth, ready to be read."""
+    """An open recording with its ground truth."""
 
     frames: Iterable[Frame]
     settings: Settings
@@ -48,7 +48,7 @@ class OpenRecording:
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """Options of the command line for a recording."""
+    """Command line options for a recording."""
 
     bag: Path
     config: Path | None
@@ -59,7 +59,7 @@ class RecordingOptions:
     ground_truth: Path | None
 
     def open(self, console: Console, weights: Path | None) -> OpenRecording:
-        """Open it.
+        """Open the recording.
 
         Raises:
             ConfigError: wrong options, or there is no truth.
@@ -83,7 +83,7 @@ class RecordingOptions:
 
 
 def choose_worlds(name: str, seed: int | None, quick: bool, count: int) -> list[TestWorld]:
-    """The first worlds of a name, or those from a seed on.
+    """Return the first worlds of a name, or those from a seed on.
 
     Raises:
         ConfigError: there is no such name.
@@ -96,7 +96,7 @@ def choose_worlds(name: str, seed: int | None, quick: bool, count: int) -> list[
 
 
 def note_on_worlds(worlds: Sequence[TestWorld], quick: bool) -> str:
-    """Figures of the worlds, for the report."""
+    """Return the figures of the worlds for the report."""
     names = ", ".join(world.name for world in worlds)
     return (
         f"Worlds: {names}; hard setting (offset path up to 4.5 m, yaw 16 deg, sun moved 70 deg, aliasing)"
@@ -105,7 +105,7 @@ def note_on_worlds(worlds: Sequence[TestWorld], quick: bool) -> str:
 
 
 def progress_bar(console: Console) -> Progress:
-    """A bar that goes when it is done."""
+    """Return a transient progress bar."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %")
@@ -120,7 +120,7 @@ REPEATS = 3
 
 @dataclass(frozen=True)
 class EveryMethod:
-    """The comparison of all methods.
+    """Comparison of all methods.
 
     Attributes:
         weights: of UMF; None: the default.
@@ -135,7 +135,7 @@ class EveryMethod:
     out: Path
 
     def worlds(self, name: str, seed: int | None, count: int) -> Figures:
-        """On simulated worlds, or on those of S3LI's simulated sequences that the thesis tests on."""
+        """Evaluate on simulated worlds, or on the simulated S3LI sequences of the thesis's test split."""
         from rich.console import Console
 
         from umf_ros.lab.evaluation.bag_run import drive_sets, world_set
@@ -155,7 +155,7 @@ class EveryMethod:
         return self._compare(Console(), map(world_set, chosen), note_on_worlds(chosen, self.quick))
 
     def places(self, listing: Path) -> Figures:
-        """On sets of still images or scans."""
+        """Evaluate on sets of still images or scans."""
         from rich.console import Console
 
         from umf_ros.lab.evaluation.bag_run import still_set
@@ -165,7 +165,7 @@ class EveryMethod:
         return self._compare(Console(), sets, f"{listing}: a match is true where the set says so.")
 
     def sequences(self, listing: Path, rule: str) -> Figures:
-        """On listed sequences."""
+        """Evaluate on listed sequences."""
         from rich.console import Console
 
         from umf_ros.lab.datasets.listed import SequenceList
@@ -181,7 +181,7 @@ class EveryMethod:
         return self._compare(Console(), sets, note)
 
     def recording(self, options: RecordingOptions) -> Figures:
-        """On the keyframes of a recording."""
+        """Evaluate on the keyframes of a recording."""
         from rich.console import Console
 
         from umf_ros.lab.evaluation.bag_run import recording_set
@@ -236,14 +236,14 @@ def command(
         str | None, Optional(help="Instead of a recording: test or validation; with --methods all also etna.")
     ] = None,
     seed: Annotated[int | None, Optional(min=0, help="First of the worlds' seeds.")] = None,
-    count: Annotated[int, Optional(min=1, max=8, help="How many worlds, of different families.")] = 4,
+    count: Annotated[int, Optional(min=1, max=8, help="Number of worlds, of different families.")] = 4,
     quick: Annotated[bool, Optional("--quick", help="A smaller sample of every world.")] = False,
-    methods: Annotated[str, Optional(help="umf, or all: every method of docs/benchmarks.md beside it.")] = "umf",
+    methods: Annotated[str, Optional(help="umf, or all: also every method of docs/benchmarks.md.")] = "umf",
     trained: Annotated[
-        Path | None, Optional(help="With --methods all, a folder of other methods' weights: NAME/NAME.safetensors.")
+        Path | None, Optional(help="With --methods all: folder of other methods' weights, NAME/NAME.safetensors.")
     ] = None,
     weights: WeightsPath = None,
-    json_file: Annotated[Path | None, Optional("--json", help="Write the figures here too.")] = None,
+    json_file: Annotated[Path | None, Optional("--json", help="Also write the figures to this file.")] = None,
     out: RunsFolder = Path("results"),
     config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording or place sets.")] = None,
     dataset: DatasetName = "auto",
@@ -251,14 +251,13 @@ def command(
     odometry: OdometryPath = None,
     odometry_frame: OdometryFrame = "",
     ground_truth: TruthPath = None,
-    rule: Annotated[str, Optional(help="Rule of the same place in listed sequences: s3li or robotcar.")] = "s3li",
+    rule: Annotated[str, Optional(help="Definition of the same place in listed sequences: s3li or robotcar.")] = "s3li",
 ) -> None:
-    """Recall, precision, rerankers, lost modalities and cost.
+    """Measure recall, precision, reranking, missing modalities and cost.
 
-    On a recording every keyframe is asked for its own past; of listed sequences (docs/training.md) every sample,
-    for the global descriptors alone. On four simulated worlds of different families
-    a second drive on an offset path under another sun is asked for the first; the default seeds of the
-    test worlds are never trained or tuned on.
+    On a recording, every keyframe queries the earlier ones; in listed sequences (docs/training.md) every sample does, by
+    global descriptors alone. On four simulated worlds of different families, a second drive on an offset path under
+    another sun queries the first; nothing is trained or tuned on the default seeds of the test worlds.
     """
     _check(data, worlds, methods, trained)
     listed = data is not None and data.suffix in (".yaml", ".yml")
@@ -297,7 +296,7 @@ def command(
 
 
 def _check(data: Path | None, worlds: str | None, methods: str, trained: Path | None) -> None:
-    """Refuse wrong arguments before the slow imports."""
+    """Refuse invalid arguments before the slow imports."""
     if (data is None) == (worlds is None):
         raise ConfigError("expected either a recording or --worlds test|validation")
     if methods not in ("umf", "all"):
@@ -307,7 +306,7 @@ def _check(data: Path | None, worlds: str | None, methods: str, trained: Path | 
 
 
 def _refuse(data: str, options: Mapping[str, object]) -> None:
-    """An option that would be ignored is a mistake, and said to be one."""
+    """Refuse options that would be ignored."""
     given = [name for name, value in options.items() if value]
     if given:
         raise ConfigError(f"{data} {'has' if data.startswith('a ') else 'have'} no use for {', '.join(given)}")

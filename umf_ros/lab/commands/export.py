@@ -23,15 +23,16 @@ def command(
         bool, typer.Option("--super-features", help="Include the super-features in an .xml; .openvino has them.")
     ] = False,
     precision: Annotated[
-        Literal["float32", "int8"], typer.Option(help="Of the convolutions; int8 takes less than half of the time.")
+        Literal["float32", "int8"],
+        typer.Option(help="Precision of the convolutions; int8 takes less than half of the time."),
     ] = "float32",
     calibration: Annotated[
-        Path, typer.Option(help="For int8: folder of rendered training worlds; those missing are rendered.")
+        Path, typer.Option(help="For int8: folder of rendered training worlds; missing ones are rendered.")
     ] = Path("runs/calibration"),
 ) -> None:
     """Export a network to OpenVINO.
 
-    The embedder runs the model that lies beside its weights, and torch where there is none.
+    The embedder uses the model beside its weights, and torch without one.
     """
     from rich.console import Console
 

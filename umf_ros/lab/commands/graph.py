@@ -26,12 +26,12 @@ File = Annotated[Path, typer.Argument(help="g2o (or TORO) file, 2-D or 3-D.")]
 def optimize(
     file: File,
     reject: Annotated[
-        str, typer.Option(help="Guards against wrong closures and misstated noise: all or none.")
+        str, typer.Option(help="Outlier rejection and estimation of the noise scale: all or none.")
     ] = "all",
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the optimised graph here (g2o).")] = None,
-    verdicts: Annotated[Path | None, typer.Option(help="Write every closure's verdict here (CSV).")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="File for the optimised graph (g2o).")] = None,
+    verdicts: Annotated[Path | None, typer.Option(help="File for the verdicts on all closures (CSV).")] = None,
 ) -> None:
-    """Drive a graph file through the back-end as if it came live, and say which closures it rejects."""
+    """Pass a graph file through the back-end as if it came live, and print the rejected closures."""
     if reject not in ("all", "none"):
         raise ConfigError(f"--reject {reject}: expected all or none")
 
@@ -103,7 +103,7 @@ def _report(console: Console, graph: PoseGraph, recording: GraphRecording) -> No
 
 
 def _compare(console: Console, graph: PoseGraph, recording: GraphRecording) -> None:
-    """Say how far the accepted closures and the path were apart before, and are after."""
+    """Print the residuals of the accepted closures before and after the optimisation."""
     import numpy as np
 
     from umf_ros.pose_graph.closures import State

@@ -15,11 +15,11 @@ KINDS = ("kitti-odometry", "kitti-raw", "euroc", "tum-rgbd", "nuscenes", "vslam-
 def command(
     kind: Annotated[str, typer.Argument(help=f"{either(KINDS)}.")],
     source: Annotated[Path, typer.Argument(help="Folder of the sequence.")],
-    out: Annotated[Path, typer.Argument(help="The .mcap to write; its .yaml and .calibration.yaml go beside it.")],
+    out: Annotated[Path, typer.Argument(help="The .mcap file to write, with .yaml and .calibration.yaml beside it.")],
 ) -> None:
     """Make a recording of KITTI, EuRoC (ASL), TUM RGB-D, nuScenes, VSLAM-LAB, or images and scans with a times.txt.
 
-    Odometry is not part of them: run one, and give its poses with --odometry.
+    They have no odometry: run one, and pass its poses to umf replay with --odometry.
     """
     if kind not in KINDS:
         raise ConfigError(f"unknown kind {kind!r}; expected {either(KINDS)}")

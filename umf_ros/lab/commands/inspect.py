@@ -1,4 +1,4 @@
-"""`umf inspect`: what is in a recording, whether it would work, and a first parameter file and calibration for it."""
+"""`umf inspect`: contents of a recording, and a first parameter file and calibration for it."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def command(
         Path | None, typer.Option("--write", help="Folder for my_rover.yaml and my_calibration.yaml.")
     ] = None,
 ) -> None:
-    """Say what a recording holds, which topics would be used, what is missing, and whether it would work.
+    """List the contents of a recording, the topics that would be used, and missing inputs.
 
-    Ends with 3 where a replay could find nothing.
+    Exit status 3: a replay could not find any closure.
     """
     check_files(bag)
     if write is not None and write.exists() and not write.is_dir():

@@ -1,4 +1,4 @@
-"""`umf report` and `umf why`: a finished run in pictures, and why one of its moments closed no loop."""
+"""`umf report` and `umf why`: report of a finished run, and diagnosis of one keyframe."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def command(
     bag: Annotated[Path, typer.Argument(help="The recording the run was made on.")],
     ground_truth: TruthPath = None,
 ) -> None:
-    """Judge a run against the truth, draw its matches and trajectory, and write report.html.
+    """Evaluate a run by the ground truth, draw its matches and trajectory, and write report.html.
 
-    The tables and trajectories of a run that was killed are written first. A recording or a truth of another run
-    changes nothing.
+    The tables and trajectories of a run that was killed are exported first. With the recording or the truth of another
+    run, nothing is written.
     """
     check_files(bag, ground_truth)
 
@@ -44,7 +44,7 @@ def command(
 
 
 def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | None = None) -> None:
-    """Judge a run and write its report; the sensors are checked, and the truth is read, by reading the recording again.
+    """Evaluate a run and write its report; read the recording again for the ground truth and the sensor check.
 
     Raises:
         UmfError: the run was made on another recording; nothing is written.
@@ -67,13 +67,13 @@ def why(
     folder: Annotated[Path, typer.Argument(help="A run folder, such as results/latest.")],
     moment: Annotated[str, typer.Argument(metavar="STAMP", help="Stamp in ns, or seconds from the first keyframe.")],
     bag: Annotated[
-        Path | None, typer.Argument(help="The recording, for its truth; default: where the run found it.")
+        Path | None, typer.Argument(help="The recording, for its ground truth; default: the path in the run.")
     ] = None,
     ground_truth: TruthPath = None,
 ) -> None:
-    """Say why a keyframe closed no loop: what the database returned, which gate stopped it, and by how much.
+    """Explain why a keyframe closed no loop: its candidates, the stage that rejected them, and the margin.
 
-    Also which parameter would have let it through, and what that costs. Reads the run folder alone.
+    Also prints the parameter that would accept it, and the effect on other closures. Reads the run folder only.
     """
     from rich.console import Console
 
@@ -125,8 +125,8 @@ def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -
         apart = f", {why.distance_m:.1f} m away by the truth" if why.distance_m < float("inf") else ""
         say(f"the place is that of {at(why.match_stamp_ns)}, {why.match_stamp_ns} ns{apart}")
     if why.gate != "found":
-        through = why.parameter or "no parameter: the measurements do not speak for it"
-        say(f"would let it through: {escape(through)}")
+        through = why.parameter or "no parameter: its measurements do not support a closure"
+        say(f"would accept it: {escape(through)}")
     if tested := about.tested[why.stamp_ns]:
         table = Table("returned", "similarity", "probability", "m by the truth", "reason", box=None, pad_edge=False)
         for one in tested[:SHOWN]:
@@ -140,7 +140,7 @@ def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -
     for name, value in sorted(why.contributions.items(), key=lambda one: -abs(one[1]))[:SHOWN]:
         say(f"  {name.replace('_', ' '):24} {value:+.1f}")
     if why.match_stamp_ns is not None:
-        say(f"a picture of it: umf explain BAG {why.stamp_ns} {why.match_stamp_ns}")
+        say(f"picture: umf explain BAG {why.stamp_ns} {why.match_stamp_ns}")
 
 
 def recover_run(folder: Path) -> bool:

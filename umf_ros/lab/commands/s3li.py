@@ -1,4 +1,4 @@
-"""`umf s3li`: from a download of S3LI to figures."""
+"""`umf s3li`: evaluation on a download of S3LI."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def command(
     folder: Annotated[Path, typer.Argument(help="Download of S3LI: Etna, Vulcano, or both.")],
     out: Annotated[Path, typer.Option(help="Folder of runs, tables and report.")] = Path("results/s3li"),
     figures: Annotated[Path | None, typer.Option("--json", help="Also write the figures to this file.")] = None,
-    sequences: Annotated[str, typer.Option(help="Names with commas between; default: all that are there.")] = "",
-    resume: Annotated[bool, typer.Option("--resume", help="Keep the sequences that --out has already.")] = False,
+    sequences: Annotated[str, typer.Option(help="Comma-separated names; default: all that are found.")] = "",
+    resume: Annotated[bool, typer.Option("--resume", help="Keep the finished sequences in --out.")] = False,
 ) -> None:
-    """Replay every sequence of S3LI that is there, judge it by the satellites, and print three protocols.
+    """Replay all sequences of S3LI in a folder, evaluate them by GNSS, and print three protocols.
 
     UMF's recall@1, MPRF's precision@1 with the toolkit's pairs, and precision and recall of published closures with the
-    errors of the trajectory before and after. A sequence that fails costs itself alone; then the command ends with 1.
+    trajectory errors before and after. If a sequence fails, the others continue, and the exit status is 1.
     """
     import json
 

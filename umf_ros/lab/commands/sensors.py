@@ -1,4 +1,4 @@
-"""`umf sensors`: what LiDAR and camera find together, and what each finds alone."""
+"""`umf sensors`: closures with both sensors, with the LiDAR alone and with the camera alone."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ def command(
     bag: Annotated[
         Path | None, typer.Argument(help="Recording with ground truth; default: one is simulated.", show_default=False)
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="World and drive, where one is simulated.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated world and drive.")] = 1,
     config: ConfigPath = None,
     out: RunsFolder = Path("results"),
-    workers: Annotated[int, typer.Option(min=1, max=3, help="Replays at a time.")] = 2,
-    report: Annotated[bool, typer.Option("--report", help="Write a report for each replay, too.")] = False,
+    workers: Annotated[int, typer.Option(min=1, max=3, help="Replays in parallel.")] = 2,
+    report: Annotated[bool, typer.Option("--report", help="Also write a report for each replay.")] = False,
 ) -> None:
     """Check the sensors of a recording, and replay it with both, with the LiDAR alone and with the camera alone.
 
     Faults of exposure, clocks, mountings and baseline are printed first, then notes on what cannot be measured.
-    Without a recording, a drive is simulated that passes a stretch where the LiDAR sees nothing, even ground, and one
-    where the camera sees nothing, after sunset. Takes some minutes.
+    Without a recording, a drive is simulated over even ground, where scans show no structure, and after sunset, where
+    images are black. Takes some minutes.
     """
     if bag is not None:
         check_files(bag, config)

@@ -1,4 +1,4 @@
-"""`umf simulate`: a drive through a planetary world as a bag, as training shards, or as a picture to look at."""
+"""`umf simulate`: a drive through a planetary world as a recording, as training shards, or as a picture."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ def command(
             "landmarks."
         ),
     ] = "demo",
-    seed: Annotated[int, typer.Option(help="World, route, light and noise.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of world, route, light and noise.")] = 1,
     world: Annotated[
-        int | None, typer.Option(help="Seed of the world alone, for several drives through one; default: --seed.")
+        int | None, typer.Option(help="Seed of the world, for several drives in one world; default: --seed.")
     ] = None,
     duration: Annotated[float | None, typer.Option(help="Seconds; default: the whole drive.")] = None,
     family: Annotated[
         str | None,
         typer.Option(help="etna, moon, canyon, terrain, dunes, mesa, mounds or random; default: the preset's."),
     ] = None,
-    aliasing: Annotated[float | None, typer.Option(help="How much the world repeats itself, 0 to 1.")] = None,
+    aliasing: Annotated[float | None, typer.Option(help="Share of repeated landmarks, 0 to 1.")] = None,
     image_rate: Annotated[
         float | None, typer.Option(help="Images per second, up to 30; default: one near each scan.")
     ] = None,
     truth: Annotated[bool, typer.Option("--truth", help="Add depth, semantic and instance maps.")] = False,
     shards: Annotated[
-        Path | None, typer.Option(help="Write training shards to this folder instead; those there are kept.")
+        Path | None, typer.Option(help="Write training shards to this folder instead; existing ones are kept.")
     ] = None,
     worlds: Annotated[str, typer.Option(help="Seeds of the shards, as first:last+1.")] = "0:8",
-    every: Annotated[int, typer.Option(min=1, help="Every n-th sample of the shards' passes: a smaller set.")] = 1,
+    every: Annotated[int, typer.Option(min=1, help="Keep every n-th sample of the shards.")] = 1,
     sequences: Annotated[
         str,
         typer.Option(
@@ -56,19 +56,19 @@ def command(
     ] = "",
     folder: Annotated[Path | None, typer.Option("--out", help="Folder of s3li-twin.", show_default=False)] = None,
     scale: Annotated[
-        float, typer.Option(min=0.01, max=1, help="Of the lengths of s3li-twin's drives; none falls below 60 m.")
+        float, typer.Option(min=0.01, max=1, help="Scale of the lengths of s3li-twin's drives; at least 60 m each.")
     ] = 1.0,
-    fine: Annotated[bool, typer.Option("--fine", help="Render s3li-twin's pictures pixel by pixel.")] = False,
+    fine: Annotated[bool, typer.Option("--fine", help="Render all pixels of s3li-twin's images.")] = False,
     contact_sheet: Annotated[Path | None, typer.Option(help="Write a PNG of 24 frames and 6 scans instead.")] = None,
-    workers: Annotated[int, typer.Option(min=1, max=64, help="Threads that render.")] = 2,
+    workers: Annotated[int, typer.Option(min=1, max=64, help="Rendering threads.")] = 2,
     ray: Annotated[
         str | None, typer.Option(help="Spread --shards by Ray: address of a cluster that sees their folder, or local.")
     ] = None,
 ) -> None:
     """Simulate a rover with S3LI's sensors: stereo, LiDAR, IMU, odometry, GNSS and ground truth.
 
-    Beside OUT.mcap come OUT.odometry.tum and OUT.pos, as beside S3LI's bags. The same seed gives the same bytes.
-    `umf simulate s3li-twin --out DIR` writes all fourteen sequences of S3LI as the files that are published.
+    Also writes OUT.odometry.tum and OUT.pos, like those of S3LI. The same seed gives the same bytes.
+    `umf simulate s3li-twin --out DIR` writes all fourteen sequences of S3LI as published files.
     """
     from rich.console import Console
 

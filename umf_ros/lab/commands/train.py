@@ -15,21 +15,21 @@ if TYPE_CHECKING:
 def command(
     train: Annotated[str, typer.Argument(help="Folder of simulated worlds, or a YAML file that lists sequences.")],
     out: Annotated[Path, typer.Option(help="Folder of the run: weights, card, log, checkpoint.")] = Path("runs/train"),
-    validation: Annotated[str | None, typer.Option(help="The same, for validation.")] = None,
+    validation: Annotated[str | None, typer.Option(help="Folder or YAML file for validation.")] = None,
     method: Annotated[
         str | None,
         typer.Option(help="Training method: metric (UMF), netvlad, minkloc_fusion, dbow2, ... (docs/training.md)."),
     ] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of training settings.")] = None,
     preset: Annotated[str | None, typer.Option(help="Network: umf_light, umf_scene, umf_lite0, umf_resnet50.")] = None,
-    steps: Annotated[int | None, typer.Option(help="Optimiser steps in all.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Total number of optimiser steps.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of weights, batches and augmentation.")] = None,
     loss: Annotated[str | None, typer.Option(help="multi_similarity, triplet or neighbourhood.")] = None,
-    start: Annotated[str | None, typer.Option(help="Weights to start from.")] = None,
+    start: Annotated[str | None, typer.Option(help="Initial weights.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads per process.")] = None,
-    workers: Annotated[int | None, typer.Option(help="Processes that prepare batches ahead, for a GPU.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes that prefetch batches, for a GPU.")] = None,
     device: Annotated[str | None, typer.Option(help="torch device, or auto.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")] = False,
 ) -> None:
     """Train a network; under torchrun, on several processes or GPUs."""
     if method == "dbow2":
@@ -62,7 +62,7 @@ def _grow_vocabulary(config: Path | None, train: str, seed: int | None, out: Pat
 
 
 def train_with_bar(settings: RunSettings, out: Path, resume: bool) -> None:
-    """Train, with a bar over the steps, and say where the weights are."""
+    """Train with a progress bar, and print the path of the weights."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from umf_ros.lab.training.trainer import train
@@ -81,9 +81,7 @@ def train_with_bar(settings: RunSettings, out: Path, resume: bool) -> None:
     typer.echo(f"weights: {weights}")
 
 
-app = typer.Typer(
-    help="Pretrain an encoder without labels, by hiding a part of the data and predicting it.", no_args_is_help=True
-)
+app = typer.Typer(help="Pretrain an encoder without labels by masked reconstruction.", no_args_is_help=True)
 METHODS = {"image": "masked_images", "lidar": "masked_scans"}
 _AFTERWARDS = "\n\n`umf train --start` begins with the weights that result."
 _IMAGE = f"Pretrain the image encoder: paint hidden patches (SparK).{_AFTERWARDS}"
@@ -104,17 +102,17 @@ def pretrain(
     ] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file of settings.")] = None,
     preset: Annotated[str | None, typer.Option(help="Network: umf_light, umf_scene, umf_lite0, umf_resnet50.")] = None,
-    mask_ratio: Annotated[float | None, typer.Option(help="Share of an image's patches that is hidden.")] = None,
+    mask_ratio: Annotated[float | None, typer.Option(help="Share of masked patches of an image.")] = None,
     start: Annotated[
-        str | None, typer.Option(help="Weights to start from, as of the other encoder's pretraining.")
+        str | None, typer.Option(help="Initial weights, such as those of the other encoder's pretraining.")
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="Optimiser steps in all.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Total number of optimiser steps.")] = None,
     batch: Annotated[int | None, typer.Option(help="Frames per step.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of weights, batches and masks.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads.")] = None,
-    workers: Annotated[int | None, typer.Option(help="Processes that prepare batches ahead, for a GPU.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes that prefetch batches, for a GPU.")] = None,
     device: Annotated[str | None, typer.Option(help="torch device, or auto.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")] = False,
 ) -> None:
     """Pretrain the encoder that the subcommand names."""
     from umf_ros.core.errors import ConfigError

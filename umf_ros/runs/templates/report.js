@@ -88,7 +88,7 @@ function drawPair() {
   const table = byId("pair-facts");
   table.replaceChildren();
   row(table, "reason", pair.why);
-  row(table, "would let it through", pair.parameter);
+  row(table, "would accept it", pair.parameter);
   row(table, "probability", pair.p);
   row(table, "similarity", pair.s);
   row(table, "pose graph", pair.graph);
