@@ -49,7 +49,7 @@ from umf_ros.lab.evaluation.places_bench import bare_keyframe, made_up_drives
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import open_places
 from umf_ros.places.store import KeyframeStore, stored_identity
-from umf_ros.runs.truth import judge_closure
+from umf_ros.runs.truth import judge_closures
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
 from support.postgres import PASSWORD, CuttableLink, PostgresServer
@@ -218,7 +218,7 @@ def wrong_of(rovers: list[Rover], published: bool) -> tuple[int, int]:
                 continue
             query = rover.truth.at(np.array([closure.query_stamp_ns]))[0][0]
             match = truths[robot].at(np.array([closure.match_stamp_ns]))[0][0]
-            judged.append(judge_closure(closure, query, match).is_true)
+            judged.append(judge_closures([closure], query[None], match[None])[0].is_true)
     return len(judged), judged.count(False)
 
 

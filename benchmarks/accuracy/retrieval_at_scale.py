@@ -42,7 +42,7 @@ from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.embedding import Embedder, make_embedder
 from umf_ros.lab.evaluation.worlds import FULL, QUICK, TestWorld
 from umf_ros.lab.simulation.world import VALIDATION
-from umf_ros.runs.truth import find_revisits, judge_closure
+from umf_ros.runs.truth import find_revisits, judge_closures
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
 from support.crowds import METHODS, PLACES, CrowdedDetector, Method, crowd_of
@@ -93,7 +93,7 @@ class Recording:
 
     def _is_true(self, closure: LoopClosure) -> bool:
         (query, match), known = self._truth.at(np.array([closure.query_stamp_ns, closure.match_stamp_ns]))
-        return bool(known.all()) and judge_closure(closure, query, match).is_true
+        return bool(known.all()) and judge_closures([closure], query[None], match[None])[0].is_true
 
 
 def other_places(worlds: int, quick: bool) -> Iterator[tuple[int, Frame]]:

@@ -47,7 +47,7 @@ from umf_ros.maps.joint_graph import JointMap, solve
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import Opening, add_session, match_session, replay_session, unmatched
 from umf_ros.maps.outputs import write_results
-from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, absolute_trajectory_error, judge_closure
+from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, absolute_trajectory_error, judge_closures
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
 
@@ -133,7 +133,9 @@ def wrong_closures(joint: JointMap, truths: dict[str, Trajectory], closures: lis
         session = next(one.session for one in joint.sessions if one.session.covers(map_ns))
         return truths[session.name].at(np.array([map_ns - session.shift_ns]))[0][0]
 
-    judged = [judge_closure(c, true_pose(c.query_stamp_ns), true_pose(c.match_stamp_ns)) for c in closures]
+    judged = [
+        judge_closures([c], true_pose(c.query_stamp_ns)[None], true_pose(c.match_stamp_ns)[None])[0] for c in closures
+    ]
     return sum(not one.is_true for one in judged)
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from umf_ros.core.errors import SensorFileError
-from umf_ros.lab.scan_files import read_scan
+from umf_ros.lab.scan_files import SensorFileError, read_scan
 
 COUNT = 500
 POINTS = np.random.default_rng(1).uniform(-30, 30, (COUNT, 3)).astype(np.float32)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from recordings import CALIBRATION
 
-from umf_ros.core.errors import SensorFileError
 from umf_ros.core.geometry import transform
-from umf_ros.lab.scan_files import UNCALIBRATED, fit_image, make_snapshot, read_image
+from umf_ros.lab.scan_files import UNCALIBRATED, SensorFileError, fit_image, make_snapshot, read_image
 from umf_ros.sensors.calibration import Calibration, load_calibration
 from umf_ros.sensors.decode import Cloud
 

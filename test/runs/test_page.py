@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from finished_runs import accepted, at, candidate, closure, examined, trajectory
 from rich.console import Console
+from support.judged import judge_closure
 
 from umf_ros.bags.inputs import Advice
 from umf_ros.pose_graph.closures import ClosureReason, State
@@ -19,7 +20,7 @@ from umf_ros.runs.findings import conclude, look_first
 from umf_ros.runs.gallery import Gallery
 from umf_ros.runs.report import closure_rows, describe, final_verdicts, print_summary, write_page
 from umf_ros.runs.scene import build_scene, pairs_of
-from umf_ros.runs.truth import JudgedRun, judge_closure
+from umf_ros.runs.truth import JudgedRun
 from umf_ros.verification import RejectReason
 
 NASTY = "</script><script>alert('x')</script> & \"quotes\" [red]"

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.judged import judge_closure
 
 from umf_ros.core.config import Loop, load_settings
 from umf_ros.core.frames import LoopClosure
@@ -20,7 +21,6 @@ from umf_ros.runs.truth import (
     JudgedRun,
     absolute_trajectory_error,
     find_revisits,
-    judge_closure,
     judge_run,
     positions_in_truth,
     trajectory_error,

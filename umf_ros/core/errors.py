@@ -36,10 +36,6 @@ class BagError(UmfError):
     """A recording that is missing, foreign or damaged beyond use."""
 
 
-class SensorFileError(UmfError):
-    """A file of a scan or an image that is missing, or of another format than its name."""
-
-
 class ConfigError(UmfError):
     """A parameter that is unknown, of the wrong type or out of range."""
 

@@ -21,11 +21,10 @@ from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.storages import message_types
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.config import Topics
-from umf_ros.core.errors import SensorFileError
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose, to_quaternion
 from umf_ros.core.io import read_yaml, write_atomically
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.lab.scan_files import IMAGE_SUFFIXES, SUFFIXES, read_image, read_scan
+from umf_ros.lab.scan_files import IMAGE_SUFFIXES, SUFFIXES, SensorFileError, read_image, read_scan
 from umf_ros.lab.simulation.bag_writer import BagWriter, image_message, pose_message
 from umf_ros.sensors.decode import Cloud
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.errors import SensorFileError, either, one_line
+from umf_ros.core.errors import UmfError, either, one_line
 from umf_ros.core.frames import Frame, Image, StereoCamera
 from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, assemble
 from umf_ros.sensors.calibration import Calibration
@@ -22,6 +22,11 @@ from umf_ros.sensors.decode import FURTHEST_RETURN_M, Cloud, decode_picture, rea
 from umf_ros.sensors.sessions import StampedInput
 
 _log = logging.getLogger(__name__)
+
+
+class SensorFileError(UmfError):
+    """A file of a scan or an image that is missing, or of another format than its name."""
+
 
 Columns = dict[str, NDArray[Any]]
 Record = np.dtype[Any]

@@ -249,13 +249,6 @@ def judge_closures(
     return found
 
 
-def judge_closure(
-    closure: LoopClosure, world_T_query: Array, world_T_match: Array, has_orientation: bool = True
-) -> Judged:
-    """Judge one closure by the true poses (4, 4) of its keyframes."""
-    return judge_closures([closure], world_T_query[None], world_T_match[None], has_orientation)[0]
-
-
 def find_revisits(
     stamps: Stamps, world_T_body: Array, path_length_m: Array, rules: Loop, same_view: bool = True
 ) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from umf_ros.core.errors import CalibrationError, SensorFileError, UmfError
+from umf_ros.core.errors import CalibrationError, UmfError
 from umf_ros.lab.datasets.s3li_folder import (
     contradictions,
     find_s3li,
@@ -20,6 +20,7 @@ from umf_ros.lab.datasets.s3li_folder import (
     truth_of,
 )
 from umf_ros.lab.importing import vslam_lab
+from umf_ros.lab.scan_files import SensorFileError
 from umf_ros.sensors.calibration import load_calibration
 
 CAL = """# DLR CalLab

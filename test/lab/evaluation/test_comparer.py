@@ -12,7 +12,6 @@ from recordings import CALIBRATION
 
 from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.core.config import Verification
-from umf_ros.core.errors import SensorFileError
 from umf_ros.core.geometry import make_pose
 from umf_ros.lab.evaluation.comparison import (
     NO_CALIBRATION,
@@ -22,6 +21,7 @@ from umf_ros.lab.evaluation.comparison import (
     judge,
     similarity_of,
 )
+from umf_ros.lab.scan_files import SensorFileError
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image
 from umf_ros.verification import Verifier
 

@@ -12,10 +12,11 @@ from recordings import CALIBRATION, traverse, write_mcap
 
 from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.core.config import Verification
-from umf_ros.core.errors import CalibrationError, SensorFileError, UmfError
+from umf_ros.core.errors import CalibrationError, UmfError
 from umf_ros.core.frames import Embedding, Frame
 from umf_ros.lab.evaluation import comparison as views
 from umf_ros.lab.evaluation.comparison import Comparer, PlaceView
+from umf_ros.lab.scan_files import SensorFileError
 
 
 class CountingEmbedder(ThumbnailEmbedder):

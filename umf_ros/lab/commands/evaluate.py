@@ -255,7 +255,7 @@ def command(
 ) -> None:
     """Measure recall, precision, reranking, missing modalities and cost.
 
-    On a recording, every keyframe queries the earlier ones; in listed sequences (docs/training.md) every sample does, by
+    On a recording, every keyframe queries the earlier ones; in listed sequences (docs/training.md) every sample, by
     global descriptors alone. On four simulated worlds of different families, a second drive on an offset path under
     another sun queries the first; nothing is trained or tuned on the default seeds of the test worlds.
     """

@@ -17,12 +17,20 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import Verification
-from umf_ros.core.errors import BagError, ConfigError, SensorFileError, UmfError, writing
+from umf_ros.core.errors import BagError, ConfigError, UmfError, writing
 from umf_ros.core.frames import Candidate, Frame, Image, Keyframe, LoopClosure, Points
 from umf_ros.core.geometry import transform
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding import Embedder
-from umf_ros.lab.scan_files import OUT_OF_REACH, UNCALIBRATED, fit_image, make_snapshot, read_image, read_scan
+from umf_ros.lab.scan_files import (
+    OUT_OF_REACH,
+    UNCALIBRATED,
+    SensorFileError,
+    fit_image,
+    make_snapshot,
+    read_image,
+    read_scan,
+)
 from umf_ros.runs.run_file import pose_numbers
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.verification import Hypothesis, Verifier
