@@ -45,8 +45,6 @@ _FEW_STRETCHES = 15
 _MOUNTING = {Aid.GNSS: (0.5, 1.0), Aid.GRAVITY: (np.deg2rad(2.5), np.deg2rad(1.0))}
 _LEAST_SIGMA_M = 0.05
 _STEP = np.log(1.2)
-MOST_HELD = 400
-"""Most factors per session and source (*by hand*: of 4 km): each adds a vertex, and every event solves all of them."""
 
 Rows = NDArray[np.int64]
 Decision = tuple[State, AbsoluteReason]
@@ -240,12 +238,6 @@ class Track:
         self._decisions += [_INCOMPLETE] * len(measurements)
         more = np.full(len(measurements), np.nan)
         self._misfits, self._distances = np.append(self._misfits, more), np.append(self._distances, more)
-
-    @property
-    def held(self) -> dict[int, Factor]:
-        """Factors of the graph, by stretch: all, or evenly spread ones of a long path."""
-        every = -(-len(self.factors) // MOST_HELD)
-        return {cell: one for cell, one in self.factors.items() if every < 2 or cell % every == 0}
 
     @property
     def stamps(self) -> Rows:

@@ -182,7 +182,7 @@ class AbsoluteReference:
             one.stamp_ns
             for (own, _), track in self._tracks.items()
             if own == session
-            for cell, one in track.held.items()
+            for cell, one in track.factors.items()
             if cell not in held
         ]
         stamps += [
@@ -265,7 +265,7 @@ class AbsoluteReference:
         for (session, source), track in sorted(
             self._tracks.items(), key=lambda one: (one[0][1] is Aid.GNSS, one[0][0])
         ):
-            before = {cell: factor.numbers for cell, factor in track.held.items()}
+            before = {cell: factor.numbers for cell, factor in track.factors.items()}
             component, measured = paths.components[session], self._measured(source, track)
             path = self._path(track, session, paths, at_last)
             if source is Aid.GNSS and track.mounting is None and not self._has_gnss(component, paths):
@@ -281,7 +281,7 @@ class AbsoluteReference:
             track.judge(measured, path, known)
             if track.factors and not known:
                 self.worlds[component] = _upright(apply(path.poses, measured).mean(axis=0))
-            changed = changed or before != {cell: factor.numbers for cell, factor in track.held.items()}
+            changed = changed or before != {cell: factor.numbers for cell, factor in track.factors.items()}
         return changed
 
     def _path(self, track: Track, session: int, paths: Sessions, at_last: bool) -> MeasuredPath:
@@ -403,7 +403,7 @@ class AbsoluteReference:
 
 def _attached(track: Track, session: int, points: NDArray[np.void]) -> Factors:
     """Return the factors of a track, each at the vertex nearest to its middle, connected by the odometry between."""
-    own, factors = np.flatnonzero(points["session"] == session), track.held
+    own, factors = np.flatnonzero(points["session"] == session), track.factors
     travel, middles = points["travel"][own], (np.array(list(factors)) + 0.5) * STRETCH_M
     after = np.searchsorted(travel, middles).clip(1, max(1, len(own) - 1))
     before = middles - travel[after - 1] < travel[after.clip(max=len(own) - 1)] - middles
