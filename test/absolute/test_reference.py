@@ -161,6 +161,7 @@ def test_heights_shorten_the_drift(model: str, plain_m: float) -> None:
     assert error_m(graph) < 0.8 * plain_m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off", [(70.0, 30.0, 40.0), (-40.0, 60.0, 0.0)])
 def test_a_wrong_start_is_refused(model: str, off: tuple[float, float, float]) -> None:
     given = {"elevation_model": model, "elevation_start": start(off), "elevation_sigma_m": 0.3}
