@@ -20,7 +20,7 @@ from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings, load_preset, topics_of
 from umf_ros.core.geometry import from_quaternion, to_quaternion
 from umf_ros.core.trajectory import Trajectory, write_tum
-from umf_ros.lab.evaluation.sensors_run import check_sensors
+from umf_ros.lab.evaluation.inspection import check_sensors
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.sensors.decode import decode_pose
 

@@ -50,7 +50,7 @@ def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | No
         UmfError: the run was made on another recording; nothing is written.
     """
     from umf_ros.bags.trajectories import read_ground_truth, read_odometry
-    from umf_ros.lab.evaluation.sensors_run import check_sensors
+    from umf_ros.lab.evaluation.inspection import check_sensors
     from umf_ros.runs.reader import read_run
     from umf_ros.runs.report import finish_run
 

@@ -9,16 +9,19 @@ from typing import Any
 
 import numpy as np
 
+from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, decode
+from umf_ros.bags.sensor_check import SensorCheck, SensorReport
 from umf_ros.core.config import Settings, Topics, topics_of
 from umf_ros.core.errors import MessageError, UmfError, either
+from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
-from umf_ros.core.trajectory import bracket
+from umf_ros.core.trajectory import Trajectory, bracket
 from umf_ros.runs.findings import gap_remedy
 from umf_ros.sensors.calibration import TO_BE_MEASURED
-from umf_ros.sensors.decode import decode_camera_info, decode_cloud, decode_image, decode_odometry
+from umf_ros.sensors.decode import OdometrySample, decode_camera_info, decode_cloud, decode_image, decode_odometry
 from umf_ros.sensors.tf import TOPIC, StaticTransforms
 from umf_ros.sensors.topic_finder import find_topics
 
@@ -247,3 +250,23 @@ def _mapping(numbers: dict[str, float]) -> list[str]:
 def _pose_lines(name: str, pose: Array, note: str) -> list[str]:
     shift, turn = ([f"{value:.9g}" for value in values] for values in (pose[:3, 3], to_quaternion(pose)))
     return [f"{name}:  # {note}", f"  translation: [{', '.join(shift)}]", f"  quaternion: [{', '.join(turn)}]"]
+
+
+def check_sensors(
+    bag: Bag, settings: Settings, odometry: Trajectory | None = None, instead: Trajectory | None = None
+) -> SensorReport:
+    """Check the sensors of a recording against its odometry.
+
+    Args:
+        bag: the recording.
+        settings: to read it with.
+        odometry: that of a file, which replaces that of the recording.
+        instead: odometry for a recording without any.
+    """
+    check, samples = SensorCheck(), list[OdometrySample]()
+    for item in FrameReader(bag, settings, odometry, warn=lambda _: None).stream():
+        if isinstance(item, Frame):
+            check.take(item)
+        else:
+            samples.append(item)
+    return check.report(Trajectory.rising(samples) or instead)

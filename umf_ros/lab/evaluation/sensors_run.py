@@ -15,14 +15,10 @@ from rich.console import Console
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
-from umf_ros.bags.reader import Bag, open_bag
-from umf_ros.bags.sensor_check import SensorCheck, SensorReport
+from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
-from umf_ros.core.frames import Frame
 from umf_ros.core.tasks import spread
-from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.evaluation.results import TextTable
 from umf_ros.replay import Replay
@@ -31,7 +27,6 @@ from umf_ros.runs.report import finish_run, judge
 from umf_ros.runs.run_file import read_odometry_of
 from umf_ros.runs.truth import JudgedRun
 from umf_ros.runs.writer import count_drops
-from umf_ros.sensors.decode import OdometrySample
 
 _NOTHING = "/none"
 SENSORS: dict[str, dict[str, Any]] = {
@@ -89,26 +84,6 @@ def stretches_of(bag: Path) -> list[Stretch]:
     legs = json.loads(notes[0]["legs"]) if notes else []
     named = [Stretch(leg["label"], leg["from_ns"], leg["to_ns"]) for leg in legs if leg["label"] != "first"]
     return [*named, whole] if len(named) > 1 else [whole]
-
-
-def check_sensors(
-    bag: Bag, settings: Settings, odometry: Trajectory | None = None, instead: Trajectory | None = None
-) -> SensorReport:
-    """Check the sensors of a recording against its odometry.
-
-    Args:
-        bag: the recording.
-        settings: to read it with.
-        odometry: that of a file, which replaces that of the recording.
-        instead: odometry for a recording without any.
-    """
-    check, samples = SensorCheck(), list[OdometrySample]()
-    for item in FrameReader(bag, settings, odometry, warn=lambda _: None).stream():
-        if isinstance(item, Frame):
-            check.take(item)
-        else:
-            samples.append(item)
-    return check.report(Trajectory.rising(samples) or instead)
 
 
 def replay_all(
