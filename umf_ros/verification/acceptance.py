@@ -108,7 +108,11 @@ CRITERIA: dict[str, dict[str, Criterion]] = {
 
 
 def scores(measurements: Measurements, kind: str = "") -> dict[str, float]:
-    """How far the measurements meet every criterion of their kind, or of another, 0 to 1, by name."""
+    """How far the measurements meet every criterion of their kind, or of another, 0 to 1, by name.
+
+    In a passage its positions were compared by surfaces, and no rival by points counts.
+    """
+    measurements = measurements | (WITHOUT_RIVALS if "passage_lead" in measurements else {})
     criteria = CRITERIA[kind or kind_of(measurements)]
     return {name: criterion(measurements) for name, criterion in criteria.items()}
 
@@ -121,7 +125,7 @@ def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
     misfit = measurements["residual_m"] / measurements["noise_m"]
     if misfit > const.MAX_MISFIT:
         return RejectReason.MISFIT, f"{misfit:.0f} times"
-    if measurements.get("passage_rival", math.nan) < 1.0:
+    if measurements.get("passage_lead", math.nan) < 1.0:
         return RejectReason.PASSAGE, ""
     correlation = measurements["terrain_correlation"]
     if kind == SUBMAP and not correlation >= const.MIN_TERRAIN:

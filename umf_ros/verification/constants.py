@@ -97,18 +97,20 @@ MIN_RUNNER_UP = 0.1  # measured: of right poses 2 in 100 have a rival as near as
 PLANE_REACH_M = 0.8  # by hand: wider neighbourhoods are no surface
 PLANE_WIDTH_M, PLANE_ROUNDNESS = 0.1, 0.45  # by hand: narrower neighbourhoods lie on a single ring
 PLANE_THICKNESS_M = 0.04  # by hand: twice the noise of a range
-PLANE_SIGMA_M = 0.1  # measured: .05 and .2 m tell right poses from wrong ones less well
+PLANE_SIGMA_M = 0.04  # measured: .1 m tells right poses from wrong ones less well
 # measured: of surfaces along to surfaces across, by all normals and by planes alone; nine in ten scans of passages have
 # up to .37, and all normals of a real street from .38
 PASSAGE_RATIO = 0.38
 PASSAGE_SURFACE = 0.1  # measured: share of points on planes; woods and orchards have less, passages from .2
 PASSAGE_COMMON = 0.25  # by hand: of the compared points that a rival needs
-PASSAGE_FAR_M = np.concatenate([np.arange(-15.0, -0.9, 0.5), np.arange(1.0, 15.1, 0.5)])  # geometry: scans overlap
+PASSAGE_SHIFTS_M = np.arange(-15.0, 15.1, 0.25)  # geometry: as far as scans overlap
 PASSAGE_SAMPLE = 750  # by hand: points of a half that are compared with the other scan
-HALF_BAY_M = 2.0  # geometry: of a rack or a house; where bays repeat, wrong poses lie nearer to the identity
-# measured on validation passages (seed 10000): of poses beyond half a bay with more all are right; nearer, no wrong one
-# fits so much better than its scans fit themselves elsewhere
-PASSAGE_RIVAL, SELF_RIVAL = 0.26, 0.77
+PASSAGE_RIVALS = 16  # by hand: of these poses, that are aligned
+PASSAGE_APART_M = (
+    0.5  # measured: between these; without a distance, the right pose is not among the rivals of a wrong one
+)
+# measured on validation passages: log of the ratio of misfits, and standard deviations, the larger near the identity
+PASSAGE_LEAD, PASSAGE_SIGMAS, PATTERN_M, PATTERN_SIGMAS = 0.12, 1.6, 1.3, 2.4
 
 # temporal memory
 MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of keyframes

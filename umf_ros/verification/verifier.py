@@ -14,13 +14,14 @@ from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading, near
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
-from umf_ros.verification.ambiguity import ambiguity, passage_rival
+from umf_ros.verification.ambiguity import ambiguity
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
+from umf_ros.verification.passages import locate_along
 from umf_ros.verification.pose_search import TemporalMemory, consistent_pixels, find_hypotheses, prior_sigmas
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
-from umf_ros.verification.scan_alignment import align_scans
+from umf_ros.verification.scan_alignment import align_scans, inspect
 from umf_ros.verification.yaw_search import RotatedMaps
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
@@ -145,21 +146,32 @@ class Verifier:
         """
         aligned = self._aligned(hypotheses)
         for one in aligned:
-            query, match = one.keyframes
-            prior = prior_sigmas(query, match, one.pose, self._settings.odometry_drift)
-            support = self._memory.support(query, match, one.pose)
-            one.measurements |= measure(one) | known_only({"prior_sigmas": prior, "support": support})
+            self._measure(one)
         for one in aligned:
             one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
             if one.scans and self._acceptance.at_best(one.measurements) >= least:
-                assert one.alignment is not None
-                theirs, ours = one.scans
-                one.measurements |= ambiguity(theirs, ours, one.pose, one.alignment.information)
+                self._look_elsewhere(one)
             one.probability = self._probability(one)
-            if one.scans and self._probable(one):
-                theirs, ours = one.scans
-                one.measurements |= known_only({"passage_rival": passage_rival(theirs, ours, one.pose)})
         return aligned
+
+    def _measure(self, hypothesis: Hypothesis) -> None:
+        query, match = hypothesis.keyframes
+        prior = prior_sigmas(query, match, hypothesis.pose, self._settings.odometry_drift)
+        support = self._memory.support(query, match, hypothesis.pose)
+        hypothesis.measurements |= measure(hypothesis) | known_only({"prior_sigmas": prior, "support": support})
+
+    def _look_elsewhere(self, hypothesis: Hypothesis) -> None:
+        """Compare with other poses; in a passage, move to the best position along it."""
+        theirs, ours = hypothesis.scans
+        assert hypothesis.alignment is not None
+        found = locate_along(theirs, ours, hypothesis.pose)
+        if found is None:
+            hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
+            return
+        hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
+        self._measure(hypothesis)
+        hypothesis.measurements.pop("runner_up", None)
+        hypothesis.measurements["passage_lead"] = found.lead
 
     def _probability(self, hypothesis: Hypothesis) -> float:
         """That a hypothesis is right; where scans show bare ground alone, nothing would refute a texture seen twice."""
