@@ -98,8 +98,7 @@ PLANE_REACH_M = 0.8  # by hand: wider neighbourhoods are no surface
 PLANE_WIDTH_M, PLANE_ROUNDNESS = 0.1, 0.45  # by hand: narrower neighbourhoods lie on a single ring
 PLANE_THICKNESS_M = 0.04  # by hand: twice the noise of a range
 PLANE_SIGMA_M = 0.04  # measured: .1 m tells right poses from wrong ones less well
-# measured: of surfaces along to surfaces across, by all normals and by planes alone; nine in ten scans of passages have
-# up to .37, and all normals of a real street from .38
+# measured: of normals along to normals across; nine in ten scans of passages have up to .37, a real street from .38
 PASSAGE_RATIO = 0.38
 PASSAGE_SURFACE = 0.1  # measured: share of points on planes; woods and orchards have less, passages from .2
 PASSAGE_COMMON = 0.25  # by hand: of the compared points that a rival needs

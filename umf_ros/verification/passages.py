@@ -164,9 +164,9 @@ def passage_direction(scan: PreparedScan) -> Array | None:
     if weights[0] > const.PASSAGE_RATIO * weights[1]:  # most places are none: their planes are never asked for
         return None
     flat = np.concatenate([planes.normals[planes.planar] for planes in scan.surfaces])
-    weights, ways = _across(scan, flat)
-    if len(flat) < const.PASSAGE_SURFACE * len(scan.points) or weights[0] > const.PASSAGE_RATIO * weights[1]:
+    if len(flat) < const.PASSAGE_SURFACE * len(scan.points):
         return None
+    _, ways = _across(scan, flat)
     way: Array = scan.up.T @ np.append(ways[:, 0], 0.0)
     return way
 
