@@ -110,6 +110,17 @@ def test_what_was_rejected_comes_back_when_the_map_moves() -> None:
     assert graph.closures()[0].state is State.ACCEPTED
 
 
+def test_closures_near_the_moved_map_are_compared_again() -> None:
+    world = closing(two_laps(bias=TURN), lap_pairs(0, *range(30, 60, 3)), noise=1.0)
+    graph = driven(world, stated=2.0)
+    for row in range(len(world.closures)):
+        graph.add_closure(world.message(row))
+    assert State.REJECTED in {verdict.state for verdict in graph.closures()}
+    for _ in range(4):
+        graph.update()
+    assert accepted(graph) == {(c.first, c.second) for c in world.closures}
+
+
 def test_an_early_mistake_is_revoked_by_better_evidence() -> None:
     # without support anything that fits a vague map is taken, as a wrong closure is here
     world = closing(two_laps(), lap_pairs(0), (0, 0, 6.0))

@@ -57,6 +57,7 @@ def test_a_graph_that_worked_ahead_settles_sooner() -> None:
 
 def test_without_the_time_everything_stays_as_it_was() -> None:
     graph = live(WORLD, False)
+    graph.update()
     before, poses = states(graph.closures()), graph.trajectory()[1]
     assert graph.settle(within_s=-1.0) is None
     assert states(graph.closures()) == before

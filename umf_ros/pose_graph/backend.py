@@ -99,10 +99,10 @@ class PoseGraph:
         return self.add_closures([closure])
 
     def add_closures(self, closures: list[LoopClosure]) -> list[ClosureVerdict]:
-        """Add several closures with a single optimisation; see `add_closure`."""
+        """Add several closures with a single, rough optimisation; see `add_closure`."""
         self._refresh()
         refused = [verdict for closure in closures if (verdict := self._receive(closure))]
-        decided, known = self.update(), {id(closure) for closure in closures}
+        decided, known = self._decide(), {id(closure) for closure in closures}
         return refused + [verdict for verdict in self._pending() if id(verdict.closure) in known] + decided
 
     def hold(self, closure: LoopClosure) -> None:
@@ -133,7 +133,12 @@ class PoseGraph:
         self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
 
     def update(self) -> list[ClosureVerdict]:
-        """Decide about closures whose odometry has arrived; return new verdicts."""
+        """Decide about closures whose odometry has arrived, and solve the map exactly; return new verdicts."""
+        verdicts = self._decide()
+        self._attempt(self._rejection.refine)
+        return verdicts
+
+    def _decide(self) -> list[ClosureVerdict]:
         self._refresh()
         refused, arrived = self._take_waiting()
         verdicts = refused + self._attempt(lambda: self._rejection.consider(arrived))

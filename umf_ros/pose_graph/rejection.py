@@ -71,6 +71,7 @@ class OutlierRejection:
         self._consistency = ConsistencyGraph(settings)
         self._estimator = NoiseScaleEstimator()
         self._map: RelativeCovariances | None = None
+        self._is_rough = False
         self._ratios: list[float] = []  # likelihood of how closures fit the map if wrong over that if right
         self._joined: list[bool] = []  # whether the map joins both endpoints
         self._near_map: list[int] = []
@@ -106,17 +107,22 @@ class OutlierRejection:
     def consider(self, arrived: Sequence[PlacedClosure]) -> list[ClosureVerdict]:
         """Add closures; return the verdicts that are new or changed.
 
-        The map is solved once at most; closures near the moved map are compared by the next call.
+        The map is solved once at most, roughly; closures near the moved map are compared by the next call.
         """
         before = list(self.verdicts)
         rows = [self._take(placed) for placed in arrived]
         unsolved = bool(self.placed) and self._map is None  # the solver failed when they came
         begun = set(self._sessions.begun) - set(self._sessions.vertices["session"].tolist())
         if self._rescale() or unsolved or (rows and begun):
-            self.solve()
+            self.solve(rough=True)
             rows = list(range(len(self.placed)))
         self._decide({*rows, *self._near_map})
         return self._changed_since(before)
+
+    def refine(self) -> None:
+        """Solve a map exactly that was solved roughly."""
+        if self._is_rough:
+            self.solve()
 
     def resume(self, decided: Sequence[tuple[PlacedClosure, Decision]]) -> None:
         """Add closures with their earlier verdicts, and solve the map once, to its optimum."""
@@ -189,10 +195,10 @@ class OutlierRejection:
         # only without other accepted closures: the map moved by those may contradict these
         if not reasons:
             reasons = dict.fromkeys(self._unopposed(), ClosureReason.UNOPPOSED)
-        self._brought_close = []
+        self._near_map = []
         if self._accept(reasons):  # closures not accepted that the moved map comes close to are compared again
             rows = np.flatnonzero(~self._of(State.ACCEPTED) & ~self._revoked)
-            self._brought_close = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
+            self._near_map = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
         return bool(reasons)
 
     def _take(self, placed: PlacedClosure) -> int:
@@ -359,12 +365,14 @@ class OutlierRejection:
         for row, reason in reasons.items():
             self.verdicts[row] = replace(self.verdicts[row], state=State.ACCEPTED, reason=reason)
         if reasons:
-            self.solve()
+            self.solve(rough=True)
         return bool(reasons)
 
-    def solve(self) -> None:
-        """Solve the map with the accepted closures."""
-        self._sessions.solve(self.accepted, self.scale)
+    def solve(self, rough: bool = False) -> None:
+        """Solve the map with the accepted closures, or solve it roughly, which takes half the time."""
+        self._is_rough = True  # also after an error
+        self._sessions.solve(self.accepted, self.scale, rough)
+        self._is_rough = rough
         self._map = RelativeCovariances(self._sessions)
 
     def _reject(self, row: int, reason: ClosureReason) -> None:

@@ -102,8 +102,10 @@ class Sessions:
             poses[rows] = self.solved[session].at(points[rows])
         return poses
 
-    def solve(self, closures: Closures, scale: NoiseScale) -> None:
+    def solve(self, closures: Closures, scale: NoiseScale, rough: bool = False) -> None:
         """Move every path to the optimum of the given closures and odometry preintegrated between their endpoints.
+
+        A `rough` solution is below a centimetre from it.
 
         Raises:
             GraphError: the system cannot be solved; the paths stay as they were.
@@ -112,7 +114,7 @@ class Sessions:
             self._solver, self.scale = GraphSolver(), scale
         components, moves = self._join(closures)
         vertices, graph = self._graph(self._stamps(closures), closures, components, moves)
-        self.solution = replace(graph, poses=self._optimum(vertices, graph, components))
+        self.solution = replace(graph, poses=self._optimum(vertices, graph, components, rough))
         self.vertices, self.components = vertices, components
         self.solved |= _paths_through(vertices, self.solution.poses)
 
@@ -125,10 +127,10 @@ class Sessions:
         vertices, graph = self._graph(self._stamps(closures, every_keyframe=True), closures, self.components)
         self.solved |= _paths_through(vertices, self._optimum(vertices, graph, self.components))
 
-    def _optimum(self, points: PathPoints, graph: Graph, components: list[int]) -> Array:
+    def _optimum(self, points: PathPoints, graph: Graph, components: list[int], rough: bool = False) -> Array:
         """Return (N, 4, 4) poses at the minimum, absolute measurements included."""
         solve, given = self._solver.solve, (points, graph.anchors, graph.poses, components)
-        poses = self.reference.solve(*given, lambda held: solve(replace(graph, **held._asdict())))
+        poses = self.reference.solve(*given, lambda held: solve(replace(graph, **held._asdict()), rough))
         self.cost = self._solver.cost
         return poses
 
