@@ -45,6 +45,12 @@ class Process:
     def exit_code(self) -> int | None:
         return self._process.poll()
 
+    @property
+    def child(self) -> int:
+        """Process that this one started."""
+        (number,) = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text().split()
+        return int(number)
+
     def wait_for(self, text: str, timeout_s: float = 90.0) -> None:
         wait_until(lambda: text in self.output or self.exit_code is not None, timeout_s)
         assert text in self.output, f"'{text}' not in:\n{self.output}"

@@ -12,7 +12,8 @@ import pytest
 from umf_ros.core.config import PoseGraphSettings, Settings, dump_settings
 from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.core.frames import LoopClosure, State
-from umf_ros.durable_graph import JOURNAL, DurableGraph
+from umf_ros.durable_graph import DurableGraph
+from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.live.live_graph import settle_left
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
 

@@ -14,11 +14,12 @@ import numpy as np
 from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError, OutputError, writing
-from umf_ros.core.frames import LoopClosure
+from umf_ros.core.frames import GraphState, LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import Schema, SqliteFile
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, Decision, State
+from umf_ros.pose_graph.odometry import Stamps
 from umf_ros.runs.run_file import GraphInput, StoredOdometry
 from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
 
@@ -36,8 +37,6 @@ _NUMBERS = {ODOMETRY: 16, CLOSURE: 53, STARTED: 0, UNSETTLED: 0, **dict.fromkeys
 _NUMBERS |= dict.fromkeys(_ABSOLUTE, 15)
 _EVENT = "INSERT INTO event (kind, first_ns, second_ns, data) VALUES (?, ?, ?, ?)"
 _EVENTS = "SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"
-JOURNAL = "pose_graph.sqlite"
-"""Name of the log in a folder of results."""
 
 
 def feed(graph: PoseGraph, inputs: Iterable[GraphInput], splitter: OdometrySessionSplitter | None = None) -> bool:
@@ -141,6 +140,48 @@ class DurableGraph:
         """Decide about closures whose odometry has arrived; return new verdicts."""
         return self._logged(self.graph.update())
 
+    def prepare(self, within_s: float) -> None:
+        """See `PoseGraph.prepare`."""
+        self.graph.prepare(within_s)
+
+    def retune(self, settings: PoseGraphSettings) -> None:
+        """See `PoseGraph.retune`."""
+        self.graph.retune(settings)
+
+    def state(self) -> GraphState:
+        """Return the state of the graph."""
+        counts: dict[str, object] = {**self.graph.counts, **self.graph.reference.report()}
+        counts |= {"odometry_out_of_line": self.feed.dropped, "odometry_held": self.feed.held}
+        counts |= {state.value: count for state, count in self.graph.verdict_counts().items()}
+        probability = getattr(self.graph, "probability", None)  # of a `MapFollower`
+        pose = self.graph.map_T_odom(), self.graph.covariance()
+        return GraphState(*pose, self.feed.newest_ns, counts, self.unsettled, probability)
+
+    def recovery(self) -> str:
+        """Return a description of the resumed graph; empty if the log was new."""
+        odometry, states = self.graph.counts["odometry"], sorted(self.graph.verdict_counts().items())
+        if not self.recovered and self.feed.newest_ns < 0:
+            return ""
+        verdicts = ", ".join(f"{number} {state.value}" for state, number in states)
+        differing = f"; {self.changed} verdicts differ from before" if self.changed else ""
+        return f"recovered: {odometry} odometry messages, closures: {verdicts or 'none'}{differing}"
+
+    def closures(self, pair: tuple[int, int] | None = None) -> list[ClosureVerdict]:
+        """Return the latest verdict of every closure, or of those between two keyframes."""
+        found = self.graph.closures()
+        return found if pair is None else [verdict for verdict in found if _pair(verdict.closure) == pair]
+
+    def last_accepted(self) -> LoopClosure | None:
+        """Return the accepted closure that arrived last."""
+        found = self.graph.closures()
+        return next((one.closure for one in reversed(found) if one.state is State.ACCEPTED), None)
+
+    def drawing(self) -> tuple[Stamps, Array, Array, Array]:
+        """Return stamps and poses of the path, and (N, 2, 3) ends of accepted and of other closures in the map."""
+        verdicts, lines = self.graph.closure_lines()
+        accepted = np.array([verdict.state is State.ACCEPTED for verdict in verdicts], bool)
+        return *self.graph.trajectory(), lines[accepted], lines[~accepted]
+
     def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
         """Settle the graph and write its results; mark a graph that is not settled in time in the log.
 
@@ -210,7 +251,7 @@ class DurableGraph:
         self._write(f"PRAGMA user_version = {self._mark}")
         found = self.graph.closures()
         self.recovered = len(found)
-        states = {(v.closure.match_stamp_ns, v.closure.query_stamp_ns): v.state for v in found}
+        states = {_pair(v.closure): v.state for v in found}
         self.changed = sum(states.get(pair) != state for pair, (state, *_) in verdicts.items())
 
     def _inputs(self, events: Iterable[tuple[Any, ...]], decided: dict[tuple[int, int], State]) -> Iterator[GraphInput]:
@@ -254,6 +295,10 @@ class DurableGraph:
                 connection.executemany(statement, rows) if rows else connection.execute(statement)
         except OutputError as error:
             self._on_fault(error)
+
+
+def _pair(closure: LoopClosure) -> tuple[int, int]:
+    return closure.match_stamp_ns, closure.query_stamp_ns
 
 
 def _decision(state: str, reason: str, *numbers: float | None) -> Decision:

@@ -18,7 +18,8 @@ from std_srvs.srv import Trigger
 
 from umf_ros.core.config import load_settings
 from umf_ros.core.geometry import Array
-from umf_ros.durable_graph import JOURNAL, DurableGraph
+from umf_ros.durable_graph import DurableGraph
+from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops
 from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, to_pose, to_time
 from umf_ros.pose_graph.backend import PoseGraph

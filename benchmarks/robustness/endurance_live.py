@@ -25,7 +25,7 @@ from std_msgs.msg import String
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import load_settings, topics_of
-from umf_ros.durable_graph import JOURNAL
+from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.live.live_graph import LiveGraph
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
 from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, from_time, to_pose, to_time

@@ -14,7 +14,8 @@ from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteReason, Ai
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.frames import State
 from umf_ros.core.geometry import align, heading, transform
-from umf_ros.durable_graph import JOURNAL, DurableGraph
+from umf_ros.durable_graph import DurableGraph
+from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, AbsoluteWorld, open_ground
 from umf_ros.pose_graph.backend import PoseGraph
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -243,8 +245,9 @@ def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Pat
     rig.until(lambda: len(verdicts(rig)) == len(rig.world.closures))
     rig.values.clear()
     rig.until(lambda: rig.values.get("accepted"))
-    before, odometry_before = rig.values["accepted"], rig.taken
+    before, odometry_before, solver = rig.values["accepted"], rig.taken, Path(f"/proc/{process.child}")
     process.kill()
+    assert wait_until(lambda: not solver.exists())
     rig.values.clear()
     again = Process(MODULE, tmp_path / "two.log", *parameters)
     again.wait_for("ready")
@@ -255,6 +258,27 @@ def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Pat
     assert second.exit_code == 1 and "is in use by another process" in second.output
     assert len(second.output.strip().splitlines()) == 1
     for one in (again, second):
+        one.kill()
+
+
+def test_the_end_of_the_solver_ends_the_node_and_loses_nothing(rig: Rig, tmp_path: Path) -> None:
+    parameters = f"results_dir:={tmp_path / 'results'}", "topics.odometry:=/odom"
+    process = Process(MODULE, tmp_path / "one.log", *parameters)
+    process.wait_for("ready")
+    rig.until(lambda: rig.odometry.get_subscription_count())
+    rig.drive(0, 50)
+    rig.until(lambda: rig.taken >= 45)
+    taken = rig.taken
+    os.kill(process.child, signal.SIGKILL)
+    assert wait_until(lambda: process.exit_code is not None)
+    journal = tmp_path / "results" / "pose_graph.sqlite"
+    line = f"umf: the process of the pose graph ended by SIGKILL: the next start resumes it from {journal}"
+    assert process.exit_code == 1 and process.output.splitlines().count(line) == 1
+    assert process.output.splitlines()[-1] == line and "Traceback" not in process.output
+    again = Process(MODULE, tmp_path / "two.log", *parameters)
+    again.wait_for("ready")
+    assert f"recovered: {taken} odometry messages" in again.output
+    for one in (process, again):
         one.kill()
 
 

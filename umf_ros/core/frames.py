@@ -7,6 +7,7 @@ z up), the camera frame is optical (x right, y down, z forward). Poses follow `g
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -228,3 +229,24 @@ class LoopClosure:
     def endpoints(self) -> tuple[int, int]:
         """Stamps in ns of query and match, which identify a closure of a run."""
         return self.query_stamp_ns, self.match_stamp_ns
+
+
+@dataclass(frozen=True, slots=True)
+class GraphState:
+    """State of a pose graph at one moment.
+
+    Attributes:
+        map_T_odom: (4, 4) pose of the odometry's frame in the map; None while it is unknown.
+        covariance: (6, 6) of the newest pose in ROS order, axes of the map.
+        newest_ns: stamp of the newest odometry of the running session, -1 before its first.
+        counts: of messages, and of closures and absolute measurements by state, with faults of their sources.
+        unsettled: whether the graph was written before it was settled.
+        probability: of the pose in a fixed map; None for a graph.
+    """
+
+    map_T_odom: Array | None
+    covariance: Array
+    newest_ns: int
+    counts: Mapping[str, object]
+    unsettled: bool
+    probability: float | None

@@ -9,7 +9,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from diagnostic_msgs.srv import AddDiagnostics
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
@@ -26,9 +25,7 @@ from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, topics_of
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure
-from umf_ros.core.geometry import Array
-from umf_ros.durable_graph import JOURNAL, DurableGraph
-from umf_ros.localizer import MapFollower
+from umf_ros.graph_process import JOURNAL, ProcessEndedError, start_graph
 from umf_ros.nodes import conversions as messages
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import (
@@ -51,7 +48,7 @@ ODOMETRY_DEPTH = 200
 # minutes of fast odometry: none is lost while the optimiser works
 QUEUE = 100_000
 FRONT_END = "loop_closure_node"
-SETTLE_S, PREPARE_S = 1.0, 0.2
+SETTLE_S, PREPARE_S = 0.4, 0.2
 """Longest time to settle the graph at the end, and to prepare for it once per second."""
 UNSETTLED = "no time to settle the graph: its current results were written; the next start with this folder settles it"
 DRAWING = 20.0
@@ -61,7 +58,7 @@ GRACE_S = 0.5
 
 
 class PoseGraphNode(BaseNode):
-    """Back-end node: a pose graph in a thread of its own, and the pose in the map at the odometry's rate."""
+    """Back-end node: a pose graph in a process of its own, and the pose in the map at the odometry's rate."""
 
     def __init__(self) -> None:
         self._front_end_busy = False
@@ -72,22 +69,18 @@ class PoseGraphNode(BaseNode):
         settings = self._settings
         self._frames = settings.frames
         journal = Path(self._results) / JOURNAL if self._results and not settings.localizing else None
-        make = partial(MapFollower, settings) if settings.localizing else None
-        self._durable = DurableGraph(settings.pose_graph, journal, self._report_fault, make)
-        # None: in a fixed map, the rover may be anywhere
-        self._map_T_odom: Array | None = None if settings.localizing else np.eye(4)
-        self._covariance: Array = np.zeros((6, 6))
+        self._durable = start_graph(settings, journal, self._report_fault)
+        self._state = self._durable.state()
         # newest odometry in path and markers; None: verdicts have changed since
         self._drawn_ns: int | None = None
         self._next_draw_s = 0.0
         self._update_queued = False
-        self._absolute: dict[str, object] = {}
         self._make_publishers()
-        if self._durable.recovered or self._durable.feed.newest_ns >= 0:
-            self.get_logger().info(_recovered(self._durable))
-            self._announce(self._durable.graph.closures())
-        self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._report_fault, QUEUE)
-        if self._durable.unsettled:
+        if recovery := self._durable.recovery():
+            self.get_logger().info(recovery)
+            self._announce(self._durable.closures())
+        self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._on_failure, QUEUE)
+        if self._state.unsettled:
             self._worker.submit(lambda: self._settle_previous())
         topics = topics_of(settings)
         is_aided = bool(settings.absolute.gnss or settings.absolute.imu)
@@ -135,10 +128,17 @@ class PoseGraphNode(BaseNode):
         """Settle the graph of the previous process."""
         with watchdog.task("settling the graph", watchdog.PATIENT_S):
             self._durable.write_results(Path(self._results))
-        self._announce(self._durable.graph.closures())
+        self._announce(self._durable.closures())
+
+    def _on_failure(self, error: Exception) -> None:
+        """End the node when the process of the graph has ended."""
+        if isinstance(error, ProcessEndedError):
+            self.failure = error
+        else:
+            self._report_fault(error)
 
     def _retune(self, settings: Settings) -> None:
-        self._worker.submit(lambda: self._durable.graph.retune(settings.pose_graph))
+        self._worker.submit(lambda: self._durable.retune(settings.pose_graph))
 
     def _on_front_end(self, event: TransitionEvent) -> None:
         self._front_end_busy = event.goal_state.label == "shuttingdown"
@@ -173,10 +173,11 @@ class PoseGraphNode(BaseNode):
             self._frames = self._frames.model_copy(update={"odom": self._odometry_frames.odom})
         self._worker.submit(lambda: self._add_odometry(sample))
         # the latest correction: the pose never waits for the optimiser
-        map_T_odom = self._map_T_odom
+        state = self._state
+        map_T_odom = state.map_T_odom
         if map_T_odom is None:
             return
-        pose = messages.pose(sample.stamp_ns, map_T_odom @ sample.odom_T_body, self._covariance, self._frames)
+        pose = messages.pose(sample.stamp_ns, map_T_odom @ sample.odom_T_body, state.covariance, self._frames)
         self._pose_publisher.publish(pose)
         transform = messages.transform(sample.stamp_ns, map_T_odom, self._frames)
         self._transform_publisher.publish(transform)
@@ -214,25 +215,22 @@ class PoseGraphNode(BaseNode):
         self._drawn_ns = None
 
     def _correct(self) -> None:
-        self._map_T_odom = self._durable.graph.map_T_odom()
-        self._covariance = self._durable.graph.covariance()
+        self._state = self._durable.state()
 
     def _show(self) -> None:
         """Publish path and markers if they have changed and have subscribers; late ones get the last (latched)."""
         listeners = self._path_publisher.get_subscription_count() + self._marker_publisher.get_subscription_count()
-        newest_ns = self._durable.feed.newest_ns
+        newest_ns = self._state.newest_ns
         if listeners and self._drawn_ns != newest_ns and time.monotonic() >= self._next_draw_s:
             started_s, self._drawn_ns = time.thread_time(), newest_ns
             self._draw()
             self._next_draw_s = time.monotonic() + DRAWING * (time.thread_time() - started_s)
 
     def _draw(self) -> None:
-        stamps, poses = self._durable.graph.trajectory()
+        stamps, poses, accepted, others = self._durable.drawing()
         self._path_publisher.publish(messages.path(stamps, poses, self._frames))
-        verdicts, lines = self._durable.graph.closure_lines()
-        accepted = np.array([verdict.state is State.ACCEPTED for verdict in verdicts], bool)
-        header = messages.to_header(max(self._durable.feed.newest_ns, 0), self._frames.map)
-        self._marker_publisher.publish(messages.to_markers(lines[accepted], lines[~accepted], header))
+        header = messages.to_header(max(self._state.newest_ns, 0), self._frames.map)
+        self._marker_publisher.publish(messages.to_markers(accepted, others, header))
 
     def _tick(self) -> None:
         if not self._update_queued:  # queued at most once, however long the worker is busy
@@ -244,36 +242,31 @@ class PoseGraphNode(BaseNode):
         """Decide about closures whose odometry has arrived, and publish the new path."""
         self._update_queued = False
         self._announce(self._durable.update())
-        self._absolute = self._durable.graph.reference.report()
-        self._durable.graph.prepare(PREPARE_S)
+        if self._worker.waiting == 1:  # this update alone: a closure that waits comes first
+            self._durable.prepare(PREPARE_S)
         self._correct()
         self._show()
 
     def _own_status(self) -> DiagnosticStatus:
-        graph = self._durable.graph
-        values: dict[str, object] = {**graph.counts, **self._faults, "queue_dropped": self._worker.dropped}
-        values["odometry_out_of_line"] = self._durable.feed.dropped
-        values["odometry_held"] = self._durable.feed.held
+        state = self._state
+        values: dict[str, object] = {**state.counts, **self._faults, "queue_dropped": self._worker.dropped}
         values["queue_waiting"] = self._worker.waiting
         values["executor_stall_max_ms"] = self._stall_ms
-        values |= {state.value: count for state, count in graph.verdict_counts().items()}
-        values |= self._absolute
-        trouble = self._worker.dropped or any(name.startswith("optimiser") for name in graph.counts)
-        trouble = trouble or any("as a whole" in name for name in self._absolute)
+        trouble = self._worker.dropped or any(name.startswith("optimiser") for name in state.counts)
+        trouble = trouble or any("as a whole" in name for name in state.counts)
         text = f"{values.get('accepted', 0)} closures accepted"
-        if isinstance(graph, MapFollower):
-            values["probability"] = graph.probability
-            text = "in the map" if self._map_T_odom is not None else "not localised in the map yet"
-        if values.get("pending") and self._durable.feed.newest_ns < 0:
+        if state.probability is not None:
+            values["probability"] = state.probability
+            text = "in the map" if state.map_T_odom is not None else "not localised in the map yet"
+        if values.get("pending") and state.newest_ns < 0:
             trouble, text = True, f"{values['pending']} closures pending: no odometry received"
         level = ERROR if self._cannot_write else WARN if trouble or self._faults else OK
         return status(level, "pose graph", text, values)
 
     def _reject_last(self) -> str:
-        accepted = [v.closure for v in self._durable.graph.closures() if v.state is State.ACCEPTED]
-        if not accepted:
+        last = self._durable.last_accepted()
+        if last is None:
             raise UmfError("no closure is accepted")
-        last = accepted[-1]
         self._announce(self._durable.decide_by_hand(last.match_stamp_ns, last.query_stamp_ns, State.REJECTED))
         return f"closure {_name(last)} revoked"
 
@@ -281,7 +274,7 @@ class PoseGraphNode(BaseNode):
         """Decide about the closures between two keyframes that the request's text names."""
         pair = parse_pair(request.load_namespace)
         self._announce(self._durable.decide_by_hand(*pair, state))
-        told = [verdict for verdict in self._durable.graph.closures() if _ends(verdict.closure) == pair]
+        told = self._durable.closures(pair)
         return "; ".join(f"closure {_name(one.closure)} {one.state.value}: {one.reason}" for one in told)
 
     def _add_by_hand(self, request: AddDiagnostics.Request) -> str:
@@ -300,7 +293,7 @@ class PoseGraphNode(BaseNode):
         if self._results:
             self._durable.write_results(_numbered(Path(self._results)))
         kept = self._durable.end()
-        self._map_T_odom, self._drawn_ns = self._durable.graph.map_T_odom(), None
+        self._state, self._drawn_ns = self._durable.state(), None
         return "a new graph begins" + (f"; the old one is kept in {kept}" if kept else "")
 
 
@@ -315,24 +308,13 @@ def _numbered(results: Path) -> Path:
     return next(folder for i in count(1) if not (folder := results / f"graph_{i}").exists())
 
 
-def _recovered(durable: DurableGraph) -> str:
-    counts = durable.graph.verdict_counts()
-    verdicts = ", ".join(f"{number} {state.value}" for state, number in sorted(counts.items()))
-    differing = f"; {durable.changed} verdicts differ from before" if durable.changed else ""
-    return f"recovered: {durable.graph.counts['odometry']} odometry messages, closures: {verdicts or 'none'}{differing}"
-
-
 def _as_status(verdict: ClosureVerdict) -> DiagnosticStatus:
     level = OK if verdict.state is State.ACCEPTED else WARN
     values = {"verdict": verdict.state.value, "mahalanobis": verdict.residual, "misfit_m": verdict.residual_m}
     return status(level, _name(verdict.closure), verdict.reason, values)
 
 
-def _ends(closure: LoopClosure) -> tuple[int, int]:
-    return closure.match_stamp_ns, closure.query_stamp_ns
-
-
-def _name(closure: Any) -> str:
+def _name(closure: LoopClosure) -> str:
     return f"keyframe/{closure.match_stamp_ns} keyframe/{closure.query_stamp_ns}"
 
 

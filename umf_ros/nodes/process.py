@@ -138,7 +138,8 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
             with watchdog.watching(watchdog.PATIENT_S):
                 getattr(node, "close", lambda: None)()  # finish the work in hand and write the results
         except UmfError as error:
-            complain(error)
+            if not status or error is not getattr(node, "failure", None):  # reported above
+                complain(error)
             status = 1
         executor.shutdown()  # it must not outlive the entities that it waits for
         node.destroy_node()

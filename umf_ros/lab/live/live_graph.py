@@ -17,7 +17,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from umf_ros.core.config import load_settings
 from umf_ros.core.errors import UmfError
-from umf_ros.durable_graph import JOURNAL, DurableGraph
+from umf_ros.durable_graph import DurableGraph
+from umf_ros.graph_process import JOURNAL
 
 START_TIMEOUT_S = 180.0
 STOP_TIMEOUT_S = 60.0
