@@ -136,9 +136,9 @@ class DurableGraph:
         self._log(next(kind for kind, meant in BY_HAND.items() if meant is state), match_ns, query_ns)
         return self._logged(verdicts)
 
-    def update(self) -> list[ClosureVerdict]:
-        """Decide about closures whose odometry has arrived; return new verdicts."""
-        return self._logged(self.graph.update())
+    def update(self, exactly: bool = True) -> list[ClosureVerdict]:
+        """Decide about closures whose odometry has arrived, and solve the map exactly; return new verdicts."""
+        return self._logged(self.graph.update(exactly))
 
     def prepare(self, within_s: float) -> None:
         """See `PoseGraph.prepare`."""

@@ -80,10 +80,10 @@ class _Proxy:
             self._call("close")
         self._end()
 
-    def _call(self, name: str, *arguments: object) -> Any:
+    def _call(self, name: str, *arguments: object, **named: object) -> Any:
         with self._lock:
             try:
-                self._pipe.send((name, arguments))
+                self._pipe.send((name, arguments, named))
                 result, error, faults = self._pipe.recv()
             except (EOFError, OSError):
                 self._ended = self._ended or ProcessEndedError(self._describe_end())
@@ -112,21 +112,21 @@ def serve() -> None:
     """Make the graph and answer calls until the process at the other end of standard input closes it or ends."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    from umf_ros.durable_graph import DurableGraph
-    from umf_ros.localizer import MapFollower
-
     pipe: Connection[Any, Any] = Connection(0)
-    calls: SimpleQueue[tuple[str, tuple[Any, ...]]] = SimpleQueue()
+    calls: SimpleQueue[tuple[str, tuple[Any, ...], dict[str, Any]]] = SimpleQueue()
     faults: list[OutputError] = []
     Thread(target=_receive, args=(pipe, calls), daemon=True).start()
 
     def open_graph(settings: Settings, journal: Path | None) -> DurableGraph:
+        from umf_ros.durable_graph import DurableGraph
+        from umf_ros.localizer import MapFollower
+
         make = partial(MapFollower, settings) if settings.localizing else None
         return DurableGraph(settings.pose_graph, journal, faults.append, make)
 
     graph: DurableGraph | None = None
     while True:
-        name, arguments = calls.get()
+        name, arguments, named = calls.get()
         result: object = None
         error: Exception | None = None
         try:
@@ -134,7 +134,7 @@ def serve() -> None:
                 if graph is None:
                     graph = open_graph(*arguments)
                 else:
-                    result = getattr(graph, name)(*arguments)
+                    result = getattr(graph, name)(*arguments, **named)
         except UmfError as caught:
             error = caught
         except Exception as caught:  # of any type, also one that cannot be sent
@@ -144,7 +144,7 @@ def serve() -> None:
         faults.clear()
 
 
-def _receive(pipe: Connection[Any, Any], calls: SimpleQueue[tuple[str, tuple[Any, ...]]]) -> None:
+def _receive(pipe: Connection[Any, Any], calls: SimpleQueue[tuple[str, tuple[Any, ...], dict[str, Any]]]) -> None:
     """Queue calls; end this process at once when the other end is closed: the log holds all that arrived."""
     with suppress(EOFError, OSError):
         while True:

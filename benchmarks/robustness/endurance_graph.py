@@ -117,6 +117,7 @@ def live(poses: int, folder: Path) -> Figures:
         figures: Figures = {"stored_closures_20k": kept, "taken_up_20k": known}
         figures["reopen_s_20k"] = round(time.monotonic() - started_s, 1)
         ears.wait(1.0)
+        told_s: dict[tuple[int, int], float] = {}
         for k in range(first, poses):
             message = Odometry(child_frame_id="base_link")
             message.header.stamp, message.header.frame_id = to_time((k + 1) * PERIOD_NS), "odom"
@@ -124,11 +125,15 @@ def live(poses: int, folder: Path) -> Figures:
             odometry.publish(message)
             for row, closure in enumerate(world.closures):
                 if closure.second == k:
-                    closures.publish(closure_to_message(_later(world, row)))
+                    closures.publish(closure_to_message(later := _later(world, row)))
+                    told_s[later.match_stamp_ns, later.query_stamp_ns] = time.monotonic()
             ears.wait(0.05)
+        ears.until(lambda: ears.verdicts.keys() >= told_s.keys(), 60.0)
         ears.wait(3.0)
+        waited = [1e3 * (ears.verdicts[pair] - then_s) for pair, then_s in told_s.items() if pair in ears.verdicts]
+        figures |= spread("verdict_ms_20k", np.array(waited)) | {"verdicts_missing": len(told_s) - len(waited)}
         figures["live_stall_ms_20k"] = ears.value(BACK_END, "pose graph", "executor_stall_max_ms")
-        figures["memory_mb_20k"] = _memory_mb(node)
+        figures["memory_mb_20k"] = _memory_mb(node.process.pid)
         shutdown_s, status = node.stop()
         figures |= {"shutdown_s_20k": round(shutdown_s, 2), "fuzz_crashes": int(status != 0) + node.tracebacks()}
         ears.destroy_node()
@@ -174,9 +179,9 @@ def _later(world: GraphWorld, row: int) -> Any:
     return type(told)(*stamps, told.match_T_query, told.covariance)
 
 
-def _memory_mb(node: NodeUnderTest) -> float:
+def _memory_mb(process: int) -> float:
     """Resident memory of a process."""
-    pages = int(Path(f"/proc/{node.process.pid}/statm").read_text().split()[1])
+    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
     return round(pages * 4096 / 1e6)
 
 

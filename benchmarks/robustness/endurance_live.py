@@ -94,7 +94,7 @@ def kill_back_end(folder: Path, kills: int, rng: np.random.Generator) -> Figures
     return {
         "backend_kills": kills,
         "verdicts": len(ears.verdicts),
-        "lost_verdicts": len(ears.verdicts - (stored & written)),
+        "lost_verdicts": len(ears.verdicts.keys() - (stored & written)),
         "fuzz_crashes": crashes,
         "shutdown_s": round(shutdown_s, 2),
     }
@@ -294,7 +294,7 @@ def two_robots(folder: Path, bag: Path, config: Path) -> Figures:
         for one in ears.values():
             one.wait(0.5)
             one.destroy_node()
-    crossed = sum(len(one.verdicts - one.closures) for one in ears.values())
+    crossed = sum(len(one.verdicts.keys() - one.closures) for one in ears.values())
     return {
         "fuzz_crashes": crashes,
         "crossed_closures": crossed,

@@ -107,7 +107,7 @@ class Ears(Node):
     Attributes:
         keyframes: stamps of the keyframes that were announced.
         closures: pairs of stamps on `loop_closures`, match and query.
-        verdicts: the same, about which the back-end has spoken.
+        verdicts: seconds of the monotonic clock at the back-end's first verdict on each of these.
         values: latest diagnostics by node's full name, then by line.
     """
 
@@ -117,7 +117,7 @@ class Ears(Node):
         self._executor.add_node(self)
         self.keyframes: set[int] = set()
         self.closures: set[tuple[int, int]] = set()
-        self.verdicts: set[tuple[int, int]] = set()
+        self.verdicts: dict[tuple[int, int], float] = {}
         self.values: dict[str, dict[str, dict[str, str]]] = {}
         at = f"/{namespace}/" if namespace else "/"
         self.create_subscription(PoseStamped, f"{at}{FRONT_END}/keyframes", self._hear_keyframe, CLOSURES_QOS)
@@ -165,7 +165,7 @@ class Ears(Node):
     def _hear_verdicts(self, message: DiagnosticArray) -> None:
         for status in message.status:
             match, _, query = status.name.partition(" ")
-            self.verdicts.add((_stamp(match), _stamp(query)))
+            self.verdicts.setdefault((_stamp(match), _stamp(query)), time.monotonic())
 
     def _hear_health(self, message: DiagnosticArray) -> None:
         for status in message.status:

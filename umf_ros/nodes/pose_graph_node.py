@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,8 @@ from umf_ros.sensors.calibration import Calibration, calibration_of
 from umf_ros.sensors.decode import OdometrySample, decode_odometry, stamp_ns
 from umf_ros.sensors.topic_finder import BACK_END
 
+if find_spec("gtsam") is None:  # before inputs are searched: the process of the graph imports it
+    raise ModuleNotFoundError("gtsam is not installed", name="gtsam")
 ODOMETRY_DEPTH = 200
 # minutes of fast odometry: none is lost while the optimiser works
 QUEUE = 100_000
@@ -75,6 +78,8 @@ class PoseGraphNode(BaseNode):
         self._drawn_ns: int | None = None
         self._next_draw_s = 0.0
         self._update_queued = False
+        # each counted by one thread
+        self._closures_taken = self._closures_decided = 0
         self._make_publishers()
         if recovery := self._durable.recovery():
             self.get_logger().info(recovery)
@@ -188,7 +193,17 @@ class PoseGraphNode(BaseNode):
         if is_between_rovers(message):
             return
         closure = closure_from_message(message)
-        self._worker.submit(lambda: self._announce(self._durable.add_closure(closure)))
+        self._closures_taken += 1
+        self._worker.submit(lambda: self._add_closure(closure))
+
+    def _add_closure(self, closure: LoopClosure) -> None:
+        self._closures_decided += 1
+        self._announce(self._durable.add_closure(closure))
+
+    @property
+    def _closures_waiting(self) -> int:
+        """Closures in the worker's queue; they precede all work that can wait."""
+        return self._closures_taken - self._closures_decided
 
     def _on_reject(self, message: String) -> None:
         pair = parse_pair(message.data)
@@ -241,8 +256,8 @@ class PoseGraphNode(BaseNode):
     def _update(self) -> None:
         """Decide about closures whose odometry has arrived, and publish the new path."""
         self._update_queued = False
-        self._announce(self._durable.update())
-        if self._worker.waiting == 1:  # this update alone: a closure that waits comes first
+        self._announce(self._durable.update(exactly=not self._closures_waiting))
+        if not self._closures_waiting:
             self._durable.prepare(PREPARE_S)
         self._correct()
         self._show()

@@ -132,10 +132,11 @@ class PoseGraph:
             self._attempt(lambda: self._rejection.consider([placed]))  # noqa: B023 (called at once)
         self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
 
-    def update(self) -> list[ClosureVerdict]:
+    def update(self, exactly: bool = True) -> list[ClosureVerdict]:
         """Decide about closures whose odometry has arrived, and solve the map exactly; return new verdicts."""
         verdicts = self._decide()
-        self._attempt(self._rejection.refine)
+        if exactly:
+            self._attempt(self._rejection.refine)
         return verdicts
 
     def _decide(self) -> list[ClosureVerdict]:
