@@ -161,7 +161,7 @@ class LoopDetector:
         self.seen: PlaceDatabase | None = None
         if settings.grows_map:
             self.seen = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
-        self._submaps = SubmapFinder(settings.verification, settings.loop, self.database)
+        self._submaps = SubmapFinder(settings.verification, settings.loop, self.database, self._map)
         self._session: int | None = None
         self._stored_session = self.database.next_session
         self._ahead_m = 0.0
@@ -272,7 +272,7 @@ class LoopDetector:
 
     def match_submaps(self, keyframe: Keyframe, verdicts: list[Hypothesis]) -> list[Hypothesis]:
         """Return the verdicts, accepted ones first, with those of submaps where the scans gave no closure."""
-        return sorted(self._submaps.find(keyframe, verdicts), key=lambda verdict: verdict.closure is None)
+        return self._submaps.find(keyframe, verdicts)
 
     def remember(self, keyframe: Keyframe, stored: bool = False) -> None:
         """Store a keyframe as a place, unless it is stored already.

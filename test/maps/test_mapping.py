@@ -8,13 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recordings import CALIBRATION, ODOMETRY, START_NS, drive, traverse, write_mcap
+from submaps_drives import drive as drive_lidar
+from submaps_drives import rough_ground
 
 from umf_ros.bags.reader import open_bag
+from umf_ros.core.config import Settings
 from umf_ros.core.errors import BagError, UmfError
+from umf_ros.core.geometry import invert, relative
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import (
     Opening,
+    add_places,
     add_session,
     find_recordings,
     match_session,
@@ -144,3 +149,25 @@ def test_odometry_comes_from_a_file_of_its_name(tmp_path: Path, opening: Opening
     # noise is found in no other noise: every keyframe begins a session
     assert len(blind) > 3 and all(one.covariance is not None and np.isinf(one.covariance[0, 0]) for one in blind)
     assert [one.number for one in stored_sessions(tmp_path / "blind" / "places.sqlite")] == list(range(len(blind)))
+
+
+def test_a_narrow_lidar_joins_two_sessions_driven_in_opposite_directions(tmp_path: Path) -> None:
+    outing = drive_lidar(rough_ground(5))
+    half = len(outing.keyframes) // 2
+    target = MapFolder.open_or_create(tmp_path / "map", Settings())
+    for name, first, last in (("out", 0, half), ("back", half, 2 * half)):
+        keyframes = outing.keyframes[first:last]
+        folder = target.folder_of(name)
+        folder.mkdir(parents=True)
+        with closing(RunFile(folder)) as file:
+            for row, one in enumerate(keyframes):
+                assert one.odom_T_body is not None
+                file.append_odometry(row, StoredOdometry(one.stamp_ns, one.odom_T_body, None))
+        add_places(target, name, keyframes, ("none", 2), {"start_ns": keyframes[0].stamp_ns})
+    out, back = target.sessions
+    true = {one.stamp_ns: pose for one, pose in zip(outing.keyframes, outing.truth, strict=True)}
+    closures = [one.closure for found in match_session(target, back) for one in found if one.closure is not None]
+    assert len(closures) > half // 4
+    for closure in closures:
+        query, match = true[closure.query_stamp_ns - back.shift_ns], true[closure.match_stamp_ns - out.shift_ns]
+        assert np.linalg.norm((relative(match, query) @ invert(closure.match_T_query))[:3, 3]) < 0.5

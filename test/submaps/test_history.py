@@ -1,10 +1,11 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from submaps_drives import SPEED_M_S, Drive
 
-from umf_ros.core.config import Loop
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps.history import Rows, SubmapHistory
 from umf_ros.verification import constants as const
@@ -69,22 +70,28 @@ def test_the_part_of_the_path_between_two_places_is_found(trail: SubmapHistory) 
     assert len(trail.rows(1, 10.0, 20.0)) == 0 and len(trail.rows(0, 12.0, 11.0)) == 0
 
 
-def test_what_is_past_is_old_and_far_enough_back(trail: SubmapHistory, outing: Drive) -> None:
-    query, rules = outing.keyframes[80], Loop(min_time_gap_s=20.0, min_travel_m=15.0)
-    rows = trail.rows(0, 0.0, np.inf)
-    past = trail.past(query, rows, rules).tolist()
-    assert past and len(past) < len(rows)
-    for row in rows.tolist():
-        one = outing.keyframes[row]
-        age_s, way_m = (query.stamp_ns - one.stamp_ns) * 1e-9, query.path_length_m - one.path_length_m
-        assert (row in past) == (age_s >= 20.0 and way_m >= 15.0)
-
-
 def test_a_stored_session_has_the_same_submaps(trail: SubmapHistory, outing: Drive, database: PlaceDatabase) -> None:
     again = SubmapHistory(database)
-    for keyframe in outing.keyframes[:30]:
-        again.add(keyframe)  # what the odometry is worth is known by driving alone
     one, other = again.around(28), trail.around(28)
     assert one is not None and other is not None
     assert (again.odometry(28) == outing.keyframes[28].odom_T_body).all()
     assert len(one.points) == pytest.approx(len(other.points), rel=0.1)
+
+
+def test_scans_of_a_session_are_merged_as_far_as_its_own_odometry_allows(
+    outing: Drive, database: PlaceDatabase
+) -> None:
+    half = outing.keyframes[: len(outing.keyframes) // 2]
+    for number, slip in enumerate((0.0, 0.3)):
+        for one in half:
+            assert one.odom_T_body is not None
+            odometry = one.odom_T_body.copy()
+            odometry[:3, 3] *= 1 + slip
+            path_m = (1 + slip) * one.path_length_m
+            database.add(replace(one, session=number, odom_T_body=odometry, path_length_m=path_m))
+    right, slipping = SubmapHistory(database), SubmapHistory(database)
+    one, other = right.around(28), slipping.around(len(half) + 28)
+    assert one is not None and one.motion is not None and len(one.motion.body_T_lidars) > 5
+    merged = 1 if other is None or other.motion is None else len(other.motion.body_T_lidars)
+    assert merged < len(one.motion.body_T_lidars) / 2
+    assert slipping.drift(1).blur(10.0, 15.0) > 3 * right.drift(0).blur(10.0, 15.0)

@@ -55,4 +55,5 @@ def test_a_heading_that_turns_away_is_measured(outing: Drive) -> None:
 
 
 def test_drift_is_unknown_at_first(outing: Drive) -> None:
-    assert over(drifting(outing, 0.0, 0.0, count=8), 10.0) == (math.inf, math.inf)
+    assert over(drifting(outing, 0.0, 0.0, count=6), 10.0) == (math.inf, math.inf)
+    assert math.isfinite(over(drifting(outing, 0.0, 0.0, count=7), 10.0)[0])  # after three scans

@@ -37,6 +37,7 @@ from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
 from umf_ros.runs.run_file import CLOSURES, RunFile, StoredOdometry, closure_row
 from umf_ros.runs.writer import PLACES, count_drops
+from umf_ros.submaps import SubmapFinder
 from umf_ros.verification import Hypothesis, Verifier
 
 OnFrame = Callable[[float, Detection], None]
@@ -240,16 +241,20 @@ def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Hypot
     """
     settings = target.settings
     rows = range(session.first_place, session.first_place + session.places)
-    verifier, number = Verifier(settings.verification), -1
     found_rows: list[list[Any]] = []
     with closing(open_places(target.places)) as places:
+        verifier, number, earlier = Verifier(settings.verification), -1, range(session.first_number)
+        submaps = SubmapFinder(settings.verification, settings.loop, places, earlier)
         for row in rows:
             keyframe = places[row]
             if keyframe.session != number:
                 verifier.reset()
+                submaps.reset()
                 number = keyframe.session
-            candidates = places.query(keyframe, settings.loop, range(session.first_number))
+            candidates = places.query(keyframe, settings.loop, earlier)
             verdicts = verifier.verify(keyframe, [(found, places[found.index]) for found in candidates])
+            verdicts = submaps.find(keyframe, verdicts)
+            submaps.remember(keyframe, described=len(places))
             found_rows += [closure_row(v.closure, v.candidate.similarity) for v in verdicts if v.closure]
             yield verdicts
     write_table(target.folder_of(session.name) / BETWEEN, CLOSURES, found_rows)

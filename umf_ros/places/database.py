@@ -6,6 +6,7 @@ import json
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -163,14 +164,7 @@ class PlaceDatabase:
             rules: the places that may be candidates.
             sessions: search the places of these sessions, of any age.
         """
-
-        def admissible(rows: Rows | slice) -> Mask:
-            keys = self.store.keys[rows]
-            if sessions is not None:
-                return np.asarray((keys["session"] >= sessions.start) & (keys["session"] < sessions.stop))
-            age_ns, path_m = keyframe.stamp_ns - keys["stamp_ns"], keyframe.path_length_m - keys["travelled_m"]
-            return is_past(age_ns, path_m, rules, keys["session"] == keyframe.session)
-
+        admissible = partial(self.admissible, keyframe, rules, sessions)
         for wanted in (2 * rules.top_k, WIDER * rules.top_k):
             found = self._most_similar(keyframe.embedding.descriptor, wanted, admissible)
             similar = [(row, similarity) for row, similarity in found if similarity >= rules.min_similarity]
@@ -179,6 +173,14 @@ class PlaceDatabase:
                 break
         stamps = self.store.keys["stamp_ns"]
         return [Candidate(row, int(stamps[row]), similarity) for row, similarity in chosen]
+
+    def admissible(self, keyframe: Keyframe, rules: Loop, sessions: range | None, rows: Rows | slice) -> Mask:
+        """Return which of some rows may be candidates of a keyframe, as in `query`."""
+        keys = self.store.keys[rows]
+        if sessions is not None:
+            return np.asarray((keys["session"] >= sessions.start) & (keys["session"] < sessions.stop))
+        age_ns, path_m = keyframe.stamp_ns - keys["stamp_ns"], keyframe.path_length_m - keys["travelled_m"]
+        return is_past(age_ns, path_m, rules, keys["session"] == keyframe.session)
 
     def save(self, path: Path) -> None:
         """Write a copy of the keyframes to `path`."""

@@ -12,7 +12,7 @@ from umf_ros.core.geometry import Array, relative
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps.history import SubmapHistory
 from umf_ros.submaps.lookalikes import Lookalikes
-from umf_ros.verification import Hypothesis, Verifier
+from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
 
 NO_GUESSES: dict[int, Array] = {}
@@ -32,18 +32,21 @@ class SubmapFinder:
         settings: the verification group of the settings.
         rules: which earlier keyframes are admissible.
         database: the places; every keyframe is added there before it is remembered here.
+        sessions: compare with the places of these sessions, of any age.
 
     Raises:
         ConfigError: the acceptance model cannot be read.
     """
 
-    def __init__(self, settings: Verification, rules: Loop, database: PlaceDatabase) -> None:
-        self._rules = rules
+    def __init__(
+        self, settings: Verification, rules: Loop, database: PlaceDatabase, sessions: range | None = None
+    ) -> None:
+        self._rules, self._sessions = rules, sessions
         self._verifier = Verifier(settings)
         self.history = SubmapHistory(database)
         self._lookalikes = Lookalikes()
-        sessions = np.unique(database.store.keys["session"]).tolist()
-        rows = [self.history.rows(session, 0.0, np.inf)[:: const.DESCRIBED_EVERY] for session in sessions]
+        stored = np.unique(database.store.keys["session"]).tolist() if sessions is None else sessions
+        rows = [self.history.rows(session, 0.0, np.inf)[:: const.DESCRIBED_EVERY] for session in stored]
         self._stored: list[int] = np.concatenate([np.empty(0, np.intp), *rows]).tolist()
         self.reset()
 
@@ -62,6 +65,8 @@ class SubmapFinder:
     def find(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> list[Hypothesis]:
         """The verdicts about the candidates of a keyframe, with those about submaps where scans found nothing.
 
+        Accepted ones come first.
+
         Args:
             query: the newest keyframe, not yet remembered.
             verdicts: about its scan.
@@ -71,7 +76,7 @@ class SubmapFinder:
         expected = self._expected(query)
         candidates = self._candidates(query, verdicts, expected)
         guesses = NO_GUESSES if expected is None else {self.history.database[expected[0]].stamp_ns: expected[1]}
-        compared = self.compare(query, candidates, guesses)
+        compared = self._point_to_nearest(query, self.compare(query, candidates, guesses))
         self._note_closures(query, compared)
         known = {one.candidate.stamp_ns for one in compared}
         return compared + [one for one in verdicts if one.candidate.stamp_ns not in known]
@@ -96,19 +101,24 @@ class SubmapFinder:
         submap = self.history.before(query, first_m) if pairs else None
         return [] if submap is None else self._verifier.verify(submap, pairs, guesses)
 
-    def remember(self, keyframe: Keyframe) -> None:
-        """Take up a keyframe that was added to the database; one without a scan adds nothing to a submap."""
-        if self.history.add(keyframe) and self.history.needed:
-            self._describe(keyframe)
+    def remember(self, keyframe: Keyframe, described: int = 1) -> None:
+        """Take up a keyframe that was added to the database; one without a scan adds nothing to a submap.
 
-    def _describe(self, newest: Keyframe) -> None:
-        """Describe the submap that the newest keyframe completes, and one that was stored before, the latest first."""
+        Args:
+            keyframe: the newest one.
+            described: most submaps stored before that are described now, at a tenth of a second each.
+        """
+        if self.history.add(keyframe) and self.history.needed:
+            self._describe(keyframe, described)
+
+    def _describe(self, newest: Keyframe, stored: int) -> None:
+        """Describe the submap that the newest keyframe completes, and some that were stored before."""
         complete_m = newest.path_length_m - const.ODOMETRY_REACH_M
         rows = self.history.rows(newest.session, self._described_m, complete_m)[:1].tolist()
         if rows:
             described = self.history.database[rows[0]]
             self._described_m = described.path_length_m + const.DESCRIBED_EVERY * const.MERGE_STEP_M
-        rows += [self._stored.pop()] if self._stored else []
+        rows += [self._stored.pop() for _ in range(min(stored, len(self._stored)))]
         for row in rows:
             if (submap := self.history.around(row)) is not None:
                 self._lookalikes.add(row, submap)
@@ -122,14 +132,40 @@ class SubmapFinder:
 
     def _expected(self, query: Keyframe) -> tuple[int, Array] | None:
         """Row of the nearest keyframe where odometry puts the rover, and `match_T_query` there; None without one."""
-        for session, odom_T_query, first_m, last_m in self._predictions(query):
-            rows = self.history.past(query, self.history.rows(session, first_m, last_m), self._rules)
-            poses = [relative(self.history.odometry(row), odom_T_query) for row in rows.tolist()]
-            away = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
-            if away and min(away) < const.SAME_PLACE_M:
-                best = int(np.argmin(away))
-                return int(rows[best]), poses[best]
-        return None
+        found = (self._nearest(query, *prediction) for prediction in self._predictions(query))
+        return next((one for one in found if one is not None), None)
+
+    def _nearest(
+        self, query: Keyframe, session: int, odom_T_query: Array, first_m: float, last_m: float
+    ) -> tuple[int, Array] | None:
+        """Row nearest to a pose on a part of a session's path, and `match_T_query` there; None where none is near."""
+        rows = self.history.rows(session, first_m, last_m)
+        rows = rows[self.history.database.admissible(query, self._rules, self._sessions, rows)]
+        poses = [relative(self.history.odometry(row), odom_T_query) for row in rows.tolist()]
+        away = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
+        if not away or min(away) >= const.SAME_PLACE_M:
+            return None
+        best = int(np.argmin(away))
+        return int(rows[best]), poses[best]
+
+    def _point_to_nearest(self, query: Keyframe, verdicts: list[Hypothesis]) -> list[Hypothesis]:
+        """Return the verdicts, one found from afar replaced where the place nearest to its pose is found there too."""
+        for far in verdicts:
+            if not (far.accepted or far.reason is RejectReason.TOO_FAR):
+                continue
+            match, shift_m = far.keyframes[1], float(np.linalg.norm(far.pose[:3, 3]))
+            if match.odom_T_body is None or shift_m < const.SAME_PLACE_M:
+                continue
+            reach = match.path_length_m - const.ODOMETRY_REACH_M, match.path_length_m + const.ODOMETRY_REACH_M
+            found = self._nearest(query, match.session, match.odom_T_body @ far.pose, *reach)
+            if found is None:
+                continue
+            nearest = self._candidate(query, found[0])
+            compared = self.compare(query, [nearest], {nearest.stamp_ns: found[1]})
+            if any(one.accepted for one in compared):
+                far.reject(RejectReason.LESS_PROBABLE)
+                return compared + [one for one in verdicts if one.candidate.index != nearest.index]
+        return verdicts
 
     def _predictions(self, query: Keyframe) -> Iterator[tuple[int, Array, float, float]]:
         """Session, pose of the query in its odometry, and the part of the path where that is trusted.
@@ -167,7 +203,8 @@ class SubmapFinder:
         submap = self.history.before(query)
         if submap is None:
             return []
-        rows = self.history.past(query, np.array(self._lookalikes.rows, np.intp), self._rules)
+        rows = np.array(self._lookalikes.rows, np.intp)
+        rows = rows[self.history.database.admissible(query, self._rules, self._sessions, rows)]
         keys = self.history.database.store.keys[rows]
         # scans that both submaps hold are alike for no other reason
         first_m = query.path_length_m - 2 * const.ODOMETRY_REACH_M

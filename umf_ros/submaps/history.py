@@ -7,10 +7,9 @@ from collections import OrderedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.config import Loop
 from umf_ros.core.frames import Keyframe
-from umf_ros.core.geometry import Array
-from umf_ros.places.database import PlaceDatabase, is_past
+from umf_ros.core.geometry import Array, evenly
+from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps.merging import DriftMeter, needed_scans, submap_of
 from umf_ros.verification import constants as const
 
@@ -24,19 +23,19 @@ class SubmapHistory:
         database: has the keyframes; only their odometry and some submaps are kept here.
 
     Attributes:
-        drift: of the odometry of this session.
         needed: whether single scans of this session show too little of a place.
     """
 
     def __init__(self, database: PlaceDatabase) -> None:
         self.database = database
         self._odometry: dict[int, Array] = {}
+        self._drifts: dict[int, DriftMeter] = {}
         self._submaps: OrderedDict[tuple[int, int], Keyframe] = OrderedDict()
         self.reset()
 
     def reset(self) -> None:
         """Begin a session."""
-        self.drift, self.needed = DriftMeter(), False
+        self.needed = False
         self._recent: list[Keyframe] = []
 
     def add(self, keyframe: Keyframe) -> bool:
@@ -48,7 +47,7 @@ class SubmapHistory:
             return False
         self.needed = bool(needed_scans(keyframe, before))
         if self.needed:
-            self.drift.add(keyframe, before)
+            self._drifts.setdefault(keyframe.session, DriftMeter()).add(keyframe, before)
         self._recent = [keyframe, *before]
         return True
 
@@ -59,11 +58,17 @@ class SubmapHistory:
         rows = np.flatnonzero((keys["session"] == session) & (path_m >= first_m) & (path_m <= last_m))
         return rows[np.unique(path_m[rows] // const.MERGE_STEP_M, return_index=True)[1]]
 
-    def past(self, query: Keyframe, rows: Rows, rules: Loop) -> Rows:
-        """Those of some rows that are old enough and far enough back to be a place seen again."""
-        keys = self.database.store.keys[rows]
-        age_ns, way_m = query.stamp_ns - keys["stamp_ns"], query.path_length_m - keys["travelled_m"]
-        return rows[is_past(age_ns, way_m, rules, keys["session"] == query.session)]
+    def drift(self, session: int) -> DriftMeter:
+        """Drift of the odometry of a session; a stored one's is measured at some places along its path."""
+        if session not in self._drifts:
+            meter = self._drifts[session] = DriftMeter()
+            rows = self.rows(session, const.ODOMETRY_REACH_M / 2, np.inf)
+            for row in rows[evenly(len(rows), 2 * const.DRIFT_KNOWN)].tolist():
+                keyframe, path_m = self.database[row], float(self.database.store.keys["travelled_m"][row])
+                before = self._near(row, path_m - const.ODOMETRY_REACH_M, path_m)
+                if can_be_merged(keyframe) and needed_scans(keyframe, before):
+                    meter.add(keyframe, before)
+        return self._drifts[session]
 
     def odometry(self, row: int) -> Array:
         """Odometry (4, 4) of a keyframe that has some."""
@@ -83,7 +88,7 @@ class SubmapHistory:
         """The newest keyframe as the submap of the last metres; None where there is none."""
         if not can_be_merged(keyframe):
             return None
-        return submap_of(keyframe, self.scans_before(keyframe, first_m), self.drift)
+        return submap_of(keyframe, self.scans_before(keyframe, first_m), self.drift(keyframe.session))
 
     def around(self, row: int, last_m: float = np.inf) -> Keyframe | None:
         """A keyframe of the database as the submap of what was seen before and after it; None where there is none.
@@ -99,10 +104,8 @@ class SubmapHistory:
         last_m = min(last_m, centre_m + const.ODOMETRY_REACH_M)
         key = row, round(last_m)
         if key not in self._submaps:
-            rows = self.rows(keyframe.session, centre_m - const.ODOMETRY_REACH_M, last_m)
-            others = [one for one in (self.database[i] for i in rows.tolist() if i != row) if can_be_merged(one)]
-            others.sort(key=lambda one: abs(one.path_length_m - centre_m))
-            submap = submap_of(keyframe, others, self.drift)
+            others = self._near(row, centre_m - const.ODOMETRY_REACH_M, last_m)
+            submap = submap_of(keyframe, others, self.drift(keyframe.session))
             if submap is None:
                 return None
             self._submaps[key] = submap
@@ -110,6 +113,13 @@ class SubmapHistory:
                 self._submaps.popitem(last=False)
         self._submaps.move_to_end(key)
         return self._submaps[key]
+
+    def _near(self, row: int, first_m: float, last_m: float) -> list[Keyframe]:
+        """Other keyframes to merge with a row, on a part of its session's path, the nearest first."""
+        key = self.database.store.keys[row]
+        rows = self.rows(int(key["session"]), first_m, last_m)
+        others = [one for one in (self.database[i] for i in rows.tolist() if i != row) if can_be_merged(one)]
+        return sorted(others, key=lambda one: abs(one.path_length_m - float(key["travelled_m"])))
 
 
 def can_be_merged(keyframe: Keyframe) -> bool:

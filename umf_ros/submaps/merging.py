@@ -133,7 +133,8 @@ class DriftMeter:
         # what every metre adds alike, and what metres add by chance
         bias = np.median(gaps[:, :4] / ways, axis=0)
         chance = 1.4826 * np.median(np.abs(gaps[:, :4] - bias * ways) / np.sqrt(ways), axis=0)
-        variance = (bias * way_m) ** 2 + chance**2 * way_m
+        # the estimate of the bias errs too: by more, the shorter the path it was measured on
+        variance = (bias * way_m) ** 2 + chance**2 * way_m * (1 + way_m / ways.sum())
         return np.append(variance, variance[[3, 3]])
 
     def blur(self, way_m: float, reach_m: float) -> float:

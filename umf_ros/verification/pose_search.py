@@ -108,9 +108,11 @@ class TemporalMemory:
         return float("inf")
 
     def support(self, query: Keyframe, match: Keyframe, match_T_query: Array) -> float:
-        """How many of the remembered keyframes found a pose that odometry carries over to this one."""
+        """How many of the remembered earlier keyframes found a pose that odometry carries over to this one."""
 
         def agrees(finding: _Finding) -> bool:
+            if finding.query.stamp_ns == query.stamp_ns:
+                return False
             carried = _carried(finding, query, match)
             return carried is not None and near(carried, match_T_query, const.DISTINCT_M, const.DISTINCT_RAD)
 
