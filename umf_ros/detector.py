@@ -28,6 +28,7 @@ from umf_ros.verification import Hypothesis, RejectReason, Verifier, thin_frame
 
 if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatcher
+    from umf_ros.submaps.history import SubmapHistory
 
 logger = logging.getLogger(__name__)
 Other = TypeVar("Other")
@@ -156,12 +157,12 @@ class LoopDetector:
         self._embedder = embedder
         self._verifier = Verifier(settings.verification)
         self.database = _open_places(settings, embedder)
-        self.inter_robot = _connect_fleet(settings, self.database, embedder)
         self._map = self.database.listed
         self.seen: PlaceDatabase | None = None
         if settings.grows_map:
             self.seen = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database, self._map)
+        self.inter_robot = _connect_fleet(settings, embedder, self._submaps.history)
         self._session: int | None = None
         self._stored_session = self.database.next_session
         self._ahead_m = 0.0
@@ -381,7 +382,7 @@ def _assemble(frame: Frame, embedding: Embedding, path_length_m: float, session:
     )
 
 
-def _connect_fleet(settings: Settings, database: PlaceDatabase, embedder: Embedder) -> InterRobotMatcher | None:
+def _connect_fleet(settings: Settings, embedder: Embedder, submaps: SubmapHistory) -> InterRobotMatcher | None:
     """Connect to the server of a fleet; its packages are imported only then.
 
     Raises:
@@ -396,7 +397,7 @@ def _connect_fleet(settings: Settings, database: PlaceDatabase, embedder: Embedd
         from umf_ros.fleet.inter_robot_closures import InterRobotMatcher
     except ModuleNotFoundError as error:
         raise UmfError(f"{error.name} is not installed; database.backend: postgres needs umf_ros[fleet]") from None
-    return InterRobotMatcher(settings, database.store, (embedder.name, embedder.dimension))
+    return InterRobotMatcher(settings, submaps, (embedder.name, embedder.dimension))
 
 
 def make_detector_embedder(settings: Settings) -> Embedder:

@@ -50,6 +50,7 @@ from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import open_places
 from umf_ros.places.store import KeyframeStore, stored_identity
 from umf_ros.runs.truth import judge_closures
+from umf_ros.submaps.history import SubmapHistory
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
 from support.postgres import PASSWORD, CuttableLink, PostgresServer
@@ -91,12 +92,14 @@ class Rover:
         self._database = Database(path=str(folder / f"{self.name}.sqlite"), backend="postgres", server=address)
         known = {"embedder": identity[0], "dimension": str(identity[1])}
         self.store = KeyframeStore(Path(self._database.path), known, 400, outgoing=True)
-        self.inter_robot = InterRobotMatcher(Settings(database=self._database), self.store, identity)
+        self.submaps = SubmapHistory(self.store)
+        self.inter_robot = InterRobotMatcher(Settings(database=self._database), self.submaps, identity)
 
     def drive(self) -> Iterator[None]:
         """Store one keyframe after the other, and verify what comes back meanwhile."""
         for keyframe in self.keyframes:
             self.inter_robot.link.enqueue(self.store.add(keyframe))
+            self.submaps.add(keyframe)
             inter_closure = self.inter_robot.next()
             if inter_closure is not None:
                 self._note(inter_closure)

@@ -4,6 +4,7 @@ import logging
 import sqlite3
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -64,12 +65,33 @@ def test_places_of_another_rover_are_found_with_negative_sessions(server: Postgr
     drive(ada_places, ada, [make_keyframe(500, 3.0, seed=4)])
     assert ada.drain(20)
     (answer,) = answers_of(ada)
-    keyframe, robot, found = answer
+    keyframe, robot, found, around = answer
+    assert around is None
     candidate, match = found[0]
     assert (robot, keyframe.stamp_ns, candidate.stamp_ns) == ("bea", 500 * 10**9, 4 * 10**9)
     assert match.session < 0 and match.stamp_ns == 4 * 10**9 and len(found) == 3
     assert match.embedding.image is not None  # all that verification needs
     assert len({one.index for one, _ in found}) == 3  # verification tells candidates apart by it
+    ada.close(), bea.close()
+
+
+def test_keyframes_around_a_candidate_are_fetched_one_of_every_step(server: PostgresServer) -> None:
+    bea_places, ada_places = rover_places(server, "bea"), rover_places(server, "ada")
+    bea, ada = link_of(bea_places, server, "bea"), link_of(ada_places, server, "ada")
+    drive(bea_places, bea, [make_keyframe(i, 0.5 * i, seed=i) for i in range(120)])
+    assert bea.drain(20)
+    drive(ada_places, ada, [make_keyframe(500, 3.0, seed=60)])
+    assert ada.drain(20)
+    (answer,) = answers_of(ada)
+    ada.enqueue_around(answer._replace(found=answer.found[:1]))
+    assert ada.drain(20)
+    (answer,) = answers_of(ada)
+    ((_, match),) = answer.found
+    assert match.path_length_m == 30.0 and answer.around is not None
+    path_m = [one.path_length_m for one in answer.around]
+    assert {one.session for one in answer.around} == {match.session}
+    assert 10.0 <= min(path_m) < 11.5 and 48.5 < max(path_m) <= 50.0
+    assert len(path_m) in (26, 27) and max(b - a for a, b in pairwise(path_m)) <= 3.0
     ada.close(), bea.close()
 
 

@@ -37,7 +37,7 @@ def driven(outing: Drive, database: PlaceDatabase, count: int) -> SubmapFinder:
 
 def compared_with(finder: SubmapFinder, query: Keyframe) -> list[Keyframe]:
     """Keyframes whose submaps are compared with a query about whose scan nothing is known."""
-    return [finder.history.database[one.candidate.index] for one in finder.find(query, [])]
+    return [finder.history.store[one.candidate.index] for one in finder.find(query, [])]
 
 
 def test_a_way_driven_back_is_recognised_with_the_right_pose(outing: Drive, database: PlaceDatabase) -> None:

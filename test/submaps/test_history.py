@@ -13,7 +13,7 @@ from umf_ros.verification import constants as const
 
 @pytest.fixture
 def trail(outing: Drive, database: PlaceDatabase) -> SubmapHistory:
-    made = SubmapHistory(database)
+    made = SubmapHistory(database.store)
     for keyframe in outing.keyframes:
         database.add(keyframe)
         made.add(keyframe)
@@ -22,7 +22,7 @@ def trail(outing: Drive, database: PlaceDatabase) -> SubmapHistory:
 
 def path_of(trail: SubmapHistory, rows: Rows) -> list[float]:
     """Metres driven up to some rows of the database."""
-    return [trail.database[row].path_length_m for row in rows.tolist()]
+    return [trail.store[row].path_length_m for row in rows.tolist()]
 
 
 def test_keyframes_of_a_path_lie_apart(trail: SubmapHistory) -> None:
@@ -71,7 +71,7 @@ def test_the_part_of_the_path_between_two_places_is_found(trail: SubmapHistory) 
 
 
 def test_a_stored_session_has_the_same_submaps(trail: SubmapHistory, outing: Drive, database: PlaceDatabase) -> None:
-    again = SubmapHistory(database)
+    again = SubmapHistory(database.store)
     one, other = again.around(28), trail.around(28)
     assert one is not None and other is not None
     assert (again.odometry(28) == outing.keyframes[28].odom_T_body).all()
@@ -89,7 +89,7 @@ def test_scans_of_a_session_are_merged_as_far_as_its_own_odometry_allows(
             odometry[:3, 3] *= 1 + slip
             path_m = (1 + slip) * one.path_length_m
             database.add(replace(one, session=number, odom_T_body=odometry, path_length_m=path_m))
-    right, slipping = SubmapHistory(database), SubmapHistory(database)
+    right, slipping = SubmapHistory(database.store), SubmapHistory(database.store)
     one, other = right.around(28), slipping.around(len(half) + 28)
     assert one is not None and one.motion is not None and len(one.motion.body_T_lidars) > 5
     merged = 1 if other is None or other.motion is None else len(other.motion.body_T_lidars)

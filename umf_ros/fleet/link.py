@@ -7,11 +7,14 @@ import threading
 import time
 from collections import OrderedDict, deque
 from dataclasses import replace
+from typing import NamedTuple
+from uuid import UUID
 
 from umf_ros.core.config import Database
 from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.fleet.server import FleetKey, FleetServer, LinkError
 from umf_ros.places.store import KeyframeStore, unpack
+from umf_ros.verification import constants as const
 
 logger = logging.getLogger(__name__)
 
@@ -21,15 +24,26 @@ ASKS_KEPT = 1000
 """Queries kept while disconnected, ten minutes of driving; the oldest are dropped."""
 ANSWERS_KEPT = 20
 """Answers pending verification; while there are more, places are pushed and nothing is queried."""
-CACHED = 100
+CACHED = 200
 """Keyframes of other rovers kept in memory."""
 RETRY_S = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 """Times between attempts to reconnect."""
 
 
-Answer = tuple[Keyframe, str, list[tuple[Candidate, Keyframe]]]
-"""A keyframe of this rover, the name of another rover, and candidates of one of its sessions with their keyframes,
-whose sessions have negative numbers here."""
+class Answer(NamedTuple):
+    """Places of one session of another rover.
+
+    Attributes:
+        keyframe: of this rover.
+        robot: name of the other rover.
+        found: candidates with their keyframes, whose sessions have negative numbers here.
+        around: keyframes on the metres before and after the only candidate; None where they were not queried.
+    """
+
+    keyframe: Keyframe
+    robot: str
+    found: list[tuple[Candidate, Keyframe]]
+    around: list[Keyframe] | None = None
 
 
 class FleetLink:
@@ -53,10 +67,10 @@ class FleetLink:
         self._store, self._settings, self._identity = store, settings, identity
         self.robot, self.connected, self.pushed, self.trouble = "", False, 0, ""
         self._server: FleetServer | None = None
-        self._asks: deque[int] = deque(maxlen=ASKS_KEPT)
+        self._asks: deque[int | Answer] = deque(maxlen=ASKS_KEPT)
         self._answers: deque[Answer] = deque()
         self._cache: OrderedDict[FleetKey, Keyframe] = OrderedDict()
-        self._sessions: dict[tuple[str, object, int], int] = {}
+        self._sessions: dict[tuple[str, UUID, int], int] = {}
         self._asking = False
         self._work, self._end = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
@@ -65,6 +79,11 @@ class FleetLink:
     def enqueue(self, row: int) -> None:
         """Push and query a keyframe that was stored."""
         self._asks.append(row)
+        self._work.set()
+
+    def enqueue_around(self, answer: Answer) -> None:
+        """Query the keyframes around the only candidate of an answer; they come as another answer."""
+        self._asks.append(answer)
         self._work.set()
 
     def answer(self) -> Answer | None:
@@ -123,11 +142,14 @@ class FleetLink:
         if not self._asks or len(self._answers) >= ANSWERS_KEPT:
             return False
         self._asking = True
-        row = self._asks.popleft()
+        asked = self._asks.popleft()
         try:
-            self._ask(self._server, row)
+            if isinstance(asked, Answer):
+                self._ask_around(self._server, asked)
+            else:
+                self._ask(self._server, asked)
         except LinkError:
-            self._asks.appendleft(row)
+            self._asks.appendleft(asked)
             raise
         finally:
             self._asking = False
@@ -141,7 +163,15 @@ class FleetLink:
             if match is not None:
                 found = by_session.setdefault((key.robot, match.session), [])
                 found.append((Candidate(len(found), key.stamp_ns, similarity), match))
-        self._answers.extend((keyframe, robot, found) for (robot, _), found in by_session.items())
+        self._answers.extend(Answer(keyframe, robot, found) for (robot, _), found in by_session.items())
+
+    def _ask_around(self, server: FleetServer, answer: Answer) -> None:
+        ((_, match),) = answer.found
+        key = FleetKey(*list(self._sessions)[-1 - match.session], match.stamp_ns)
+        first_m, last_m = (match.path_length_m + sign * const.ODOMETRY_REACH_M for sign in (-1, 1))
+        keys = [one for one in server.along(key, first_m, last_m, const.MERGE_STEP_M) if one != key]
+        around = [one for one in (self._keyframe(server, key) for key in keys) if one is not None]
+        self._answers.append(answer._replace(around=around))
 
     def _keyframe(self, server: FleetServer, key: FleetKey) -> Keyframe | None:
         if key not in self._cache:

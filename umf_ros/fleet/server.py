@@ -54,6 +54,10 @@ _NEAREST = (
     "SELECT robot, store, session, stamp_ns, -(descriptor <#> %s) FROM place WHERE robot <> current_user::text "
     "ORDER BY descriptor <#> %s LIMIT %s"
 )
+_ALONG = (
+    f"SELECT DISTINCT ON (step) floor(travelled_m / %s) AS step, {_KEY_NAMES} FROM place WHERE robot = %s AND "
+    "store = %s AND session = %s AND travelled_m BETWEEN %s AND %s ORDER BY step, stamp_ns"
+)
 _DATA = "SELECT data FROM place_data WHERE robot = %s AND store = %s AND session = %s AND stamp_ns = %s"
 
 
@@ -162,6 +166,12 @@ class FleetServer:
         with _link():
             rows = self._connection.execute(_NEAREST, (vector, vector, count)).fetchall()
         return [(FleetKey(*key), float(similarity)) for *key, similarity in rows]
+
+    def along(self, key: FleetKey, first_m: float, last_m: float, step_m: float) -> list[FleetKey]:
+        """Return keyframes on a part of the path of a keyframe's session, in its order, one of every step."""
+        with _link():
+            rows = self._connection.execute(_ALONG, (step_m, *key[:3], first_m, last_m)).fetchall()
+        return [FleetKey(*row[1:]) for row in rows]
 
     def data(self, key: FleetKey) -> bytes | None:
         """Return a packed keyframe; None where there is none."""

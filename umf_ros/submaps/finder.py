@@ -41,9 +41,9 @@ class SubmapFinder:
     def __init__(
         self, settings: Verification, rules: Loop, database: PlaceDatabase, sessions: range | None = None
     ) -> None:
-        self._rules, self._sessions = rules, sessions
+        self._rules, self._database, self._sessions = rules, database, sessions
         self._verifier = Verifier(settings)
-        self.history = SubmapHistory(database)
+        self.history = SubmapHistory(database.store)
         self._lookalikes = Lookalikes()
         stored = np.unique(database.store.keys["session"]).tolist() if sessions is None else sessions
         rows = [self.history.rows(session, 0.0, np.inf)[:: const.DESCRIBED_EVERY] for session in stored]
@@ -75,7 +75,7 @@ class SubmapFinder:
             return list(verdicts)
         expected = self._expected(query)
         candidates = self._candidates(query, verdicts, expected)
-        guesses = NO_GUESSES if expected is None else {self.history.database[expected[0]].stamp_ns: expected[1]}
+        guesses = NO_GUESSES if expected is None else {self._database[expected[0]].stamp_ns: expected[1]}
         compared = self._point_to_nearest(query, self.compare(query, candidates, guesses))
         self._note_closures(query, compared)
         known = {one.candidate.stamp_ns for one in compared}
@@ -93,7 +93,7 @@ class SubmapFinder:
         """
         pairs, first_m = [], -np.inf
         for candidate in candidates:
-            match, last_m = self.history.database[candidate.index], np.inf
+            match, last_m = self._database[candidate.index], np.inf
             if match.session == query.session:  # scans that both submaps hold are alike for no other reason
                 last_m = (match.path_length_m + query.path_length_m) / 2
                 first_m = max(first_m, last_m)
@@ -116,7 +116,7 @@ class SubmapFinder:
         complete_m = newest.path_length_m - const.ODOMETRY_REACH_M
         rows = self.history.rows(newest.session, self._described_m, complete_m)[:1].tolist()
         if rows:
-            described = self.history.database[rows[0]]
+            described = self._database[rows[0]]
             self._described_m = described.path_length_m + const.DESCRIBED_EVERY * const.MERGE_STEP_M
         rows += [self._stored.pop() for _ in range(min(stored, len(self._stored)))]
         for row in rows:
@@ -127,7 +127,7 @@ class SubmapFinder:
         """Whether there are closures; odometry carries the last of them on to the next keyframes."""
         closures = [(one.candidate.index, one.closure) for one in verdicts if one.closure is not None]
         for index, closure in closures:
-            self._latest = query, self.history.database[index], closure.match_T_query
+            self._latest = query, self._database[index], closure.match_T_query
         return bool(closures)
 
     def _expected(self, query: Keyframe) -> tuple[int, Array] | None:
@@ -140,7 +140,7 @@ class SubmapFinder:
     ) -> tuple[int, Array] | None:
         """Row nearest to a pose on a part of a session's path, and `match_T_query` there; None where none is near."""
         rows = self.history.rows(session, first_m, last_m)
-        rows = rows[self.history.database.admissible(query, self._rules, self._sessions, rows)]
+        rows = rows[self._database.admissible(query, self._rules, self._sessions, rows)]
         poses = [relative(self.history.odometry(row), odom_T_query) for row in rows.tolist()]
         away = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
         if not away or min(away) >= const.SAME_PLACE_M:
@@ -195,7 +195,7 @@ class SubmapFinder:
         return list({candidate.index: candidate for candidate in found}.values())
 
     def _candidate(self, query: Keyframe, row: int) -> Candidate:
-        match = self.history.database[row]
+        match = self._database[row]
         return Candidate(row, match.stamp_ns, float(query.embedding.descriptor @ match.embedding.descriptor))
 
     def _look_alike(self, query: Keyframe) -> list[int]:
@@ -204,8 +204,8 @@ class SubmapFinder:
         if submap is None:
             return []
         rows = np.array(self._lookalikes.rows, np.intp)
-        rows = rows[self.history.database.admissible(query, self._rules, self._sessions, rows)]
-        keys = self.history.database.store.keys[rows]
+        rows = rows[self._database.admissible(query, self._rules, self._sessions, rows)]
+        keys = self._database.store.keys[rows]
         # scans that both submaps hold are alike for no other reason
         first_m = query.path_length_m - 2 * const.ODOMETRY_REACH_M
         apart = (keys["session"] != query.session) | (keys["travelled_m"] < first_m)

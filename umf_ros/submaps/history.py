@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Keyframe
-from umf_ros.core.geometry import Array, evenly
-from umf_ros.places.database import PlaceDatabase
-from umf_ros.submaps.merging import DriftMeter, needed_scans, submap_of
+from umf_ros.core.geometry import Array
+from umf_ros.places.store import KeyframeStore
+from umf_ros.submaps.merging import DriftMeter, drift_along, needed_scans, submap_of
 from umf_ros.verification import constants as const
 
 Rows = NDArray[np.intp]
@@ -20,14 +20,14 @@ class SubmapHistory:
     """Keyframes of the database by where they lie on the path of their session, and submaps of their scans.
 
     Args:
-        database: has the keyframes; only their odometry and some submaps are kept here.
+        store: has the keyframes; only their odometry and some submaps are kept here.
 
     Attributes:
         needed: whether single scans of this session show too little of a place.
     """
 
-    def __init__(self, database: PlaceDatabase) -> None:
-        self.database = database
+    def __init__(self, store: KeyframeStore) -> None:
+        self.store = store
         self._odometry: dict[int, Array] = {}
         self._drifts: dict[int, DriftMeter] = {}
         self._submaps: OrderedDict[tuple[int, int], Keyframe] = OrderedDict()
@@ -53,27 +53,25 @@ class SubmapHistory:
 
     def rows(self, session: int, first_m: float, last_m: float) -> Rows:
         """Rows of the database on a part of a session's path, in its order, one of every 1.5 m."""
-        keys = self.database.store.keys
+        keys = self.store.keys
         path_m = keys["travelled_m"]  # NaN without odometry
         rows = np.flatnonzero((keys["session"] == session) & (path_m >= first_m) & (path_m <= last_m))
         return rows[np.unique(path_m[rows] // const.MERGE_STEP_M, return_index=True)[1]]
 
     def drift(self, session: int) -> DriftMeter:
-        """Drift of the odometry of a session; a stored one's is measured at some places along its path."""
+        """Drift of the odometry of a session; a stored one's is measured in the middle of its path."""
         if session not in self._drifts:
-            meter = self._drifts[session] = DriftMeter()
-            rows = self.rows(session, const.ODOMETRY_REACH_M / 2, np.inf)
-            for row in rows[evenly(len(rows), 2 * const.DRIFT_KNOWN)].tolist():
-                keyframe, path_m = self.database[row], float(self.database.store.keys["travelled_m"][row])
-                before = self._near(row, path_m - const.ODOMETRY_REACH_M, path_m)
-                if can_be_merged(keyframe) and needed_scans(keyframe, before):
-                    meter.add(keyframe, before)
+            rows, reach = self.rows(session, -np.inf, np.inf), round(const.ODOMETRY_REACH_M / const.MERGE_STEP_M)
+            middle = rows[max(len(rows) // 2 - reach, 0) : len(rows) // 2 + reach].tolist()
+            self._drifts[session] = drift_along(
+                [one for one in map(self.store.__getitem__, middle) if can_be_merged(one)]
+            )
         return self._drifts[session]
 
     def odometry(self, row: int) -> Array:
         """Odometry (4, 4) of a keyframe that has some."""
         if row not in self._odometry:
-            found = self.database[row].odom_T_body
+            found = self.store[row].odom_T_body
             assert found is not None
             self._odometry[row] = found
         return self._odometry[row]
@@ -97,14 +95,16 @@ class SubmapHistory:
             row: of the keyframe.
             last_m: metres driven up to the last scan that may be used.
         """
-        keyframe = self.database[row]
+        keyframe = self.store[row]
         if not can_be_merged(keyframe):
             return None
         centre_m = keyframe.path_length_m
         last_m = min(last_m, centre_m + const.ODOMETRY_REACH_M)
         key = row, round(last_m)
         if key not in self._submaps:
-            others = self._near(row, centre_m - const.ODOMETRY_REACH_M, last_m)
+            rows = self.rows(keyframe.session, centre_m - const.ODOMETRY_REACH_M, last_m)
+            others = [one for one in (self.store[i] for i in rows.tolist() if i != row) if can_be_merged(one)]
+            others.sort(key=lambda one: abs(one.path_length_m - centre_m))
             submap = submap_of(keyframe, others, self.drift(keyframe.session))
             if submap is None:
                 return None
@@ -113,13 +113,6 @@ class SubmapHistory:
                 self._submaps.popitem(last=False)
         self._submaps.move_to_end(key)
         return self._submaps[key]
-
-    def _near(self, row: int, first_m: float, last_m: float) -> list[Keyframe]:
-        """Other keyframes to merge with a row, on a part of its session's path, the nearest first."""
-        key = self.database.store.keys[row]
-        rows = self.rows(int(key["session"]), first_m, last_m)
-        others = [one for one in (self.database[i] for i in rows.tolist() if i != row) if can_be_merged(one)]
-        return sorted(others, key=lambda one: abs(one.path_length_m - float(key["travelled_m"])))
 
 
 def can_be_merged(keyframe: Keyframe) -> bool:

@@ -98,6 +98,23 @@ def _reach_m(keyframe: Keyframe) -> float:
     return float(np.median(np.linalg.norm(keyframe.points, axis=1)))
 
 
+def submap_around(keyframe: Keyframe, others: Sequence[Keyframe]) -> Keyframe | None:
+    """The keyframe merged with those around it on its path, by the drift that they themselves show; as `submap_of`."""
+    path = sorted([keyframe, *others], key=lambda one: one.path_length_m)
+    return submap_of(keyframe, sorted(others, key=lambda one: _way_m(keyframe, one)), drift_along(path))
+
+
+def drift_along(path: Sequence[Keyframe]) -> DriftMeter:
+    """The drift of odometry on the second half of a path, where there are scans before."""
+    drift = DriftMeter()
+    for number in range(len(path) // 2, len(path)):
+        keyframe = path[number]
+        before = [one for one in path[number - 1 :: -1] if _way_m(keyframe, one) <= const.ODOMETRY_REACH_M]
+        if number and needed_scans(keyframe, before):
+            drift.add(keyframe, before)
+    return drift
+
+
 class DriftMeter:
     """Compares scans with those before them, as odometry joins them, over the latest tens of metres.
 
