@@ -1,14 +1,16 @@
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Embedding, Keyframe
-from umf_ros.core.geometry import Array, make_pose, transform
+from umf_ros.core.geometry import Array, invert, make_pose, relative, rotation_angle, transform
 from umf_ros.lab.simulation.scenes import CAMERA
-from umf_ros.submaps.lookalikes import Lookalikes, common_keypoints, find_keypoints
+from umf_ros.submaps.lookalikes import Lookalikes, common_keypoints, find_keypoints, guess_poses
 from umf_ros.verification import constants as const
 
 SIDE = 104
@@ -42,14 +44,17 @@ def submap(picture: np.ndarray, degrees: float = 0.0, x_m: float = 0.0, y_m: flo
 def test_keypoints_are_common_to_two_views_of_a_place_at_any_heading(degrees: float) -> None:
     match, other = find_keypoints(relief(1)), find_keypoints(relief(2))
     query = find_keypoints(turned(relief(1), degrees, 6, -4))
-    assert common_keypoints(query, match) >= 8 > 1.5 * common_keypoints(query, other)
+    count, turn, shift = common_keypoints(query, match)
+    assert count >= 8 > 1.5 * common_keypoints(query, other)[0]
+    assert math.cos(turn - math.radians(degrees)) > 0.99 or math.cos(turn + math.radians(degrees)) > 0.99
+    assert np.linalg.norm(shift) == pytest.approx(math.hypot(6, 4) * const.TERRAIN_CELL_M, abs=0.5)
 
 
 def test_a_map_of_another_scale_has_nothing_in_common() -> None:
     """Odometry that is off by a fifth is useless."""
     match = find_keypoints(relief(1))
     larger = cv2.resize(relief(1), None, fx=1.2, fy=1.2)[10:-10, 10:-10]
-    assert common_keypoints(find_keypoints(larger), match) < 8 < common_keypoints(match, match)
+    assert common_keypoints(find_keypoints(larger), match)[0] < 8 < common_keypoints(match, match)[0]
 
 
 @pytest.mark.parametrize("nothing", [LEVEL, np.full_like(LEVEL, np.nan)])
@@ -83,3 +88,12 @@ def test_ground_on_which_nothing_stands_out_is_like_none() -> None:
     lookalikes.add(8, submap(relief(1)))
     assert lookalikes.search(submap(LEVEL), both) == []
     assert lookalikes.search(submap(relief(1)), both) == [8]
+
+
+def test_keypoints_give_the_pose_of_a_submap() -> None:
+    match, query, other = submap(relief(1)), submap(relief(1), 160, 3.0, 1.5), submap(LEVEL)
+    guess = guess_poses(query, [match])[match.stamp_ns]
+    true = invert(make_pose(Rotation.from_euler("z", -160, degrees=True).as_matrix(), [-3.0, -1.5, 0.0]))
+    error = relative(true, guess)
+    assert np.linalg.norm(error[:3, 3]) < 0.5 and rotation_angle(error) < 0.05
+    assert guess_poses(query, [other]) == guess_poses(query, []) == {}

@@ -11,7 +11,7 @@ from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, relative
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps.history import SubmapHistory
-from umf_ros.submaps.lookalikes import Lookalikes
+from umf_ros.submaps.lookalikes import Lookalikes, guess_poses
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
 
@@ -99,7 +99,10 @@ class SubmapFinder:
                 first_m = max(first_m, last_m)
             pairs.append((candidate, self.history.around(candidate.index, last_m) or match))
         submap = self.history.before(query, first_m) if pairs else None
-        return [] if submap is None else self._verifier.verify(submap, pairs, guesses)
+        if submap is None:
+            return []
+        guesses = guess_poses(submap, [match for _, match in pairs if match.stamp_ns not in guesses]) | guesses
+        return self._verifier.verify(submap, pairs, guesses)
 
     def remember(self, keyframe: Keyframe, described: int = 1) -> None:
         """Take up a keyframe that was added to the database; one without a scan adds nothing to a submap.

@@ -1,7 +1,9 @@
-"""Search for submaps that look alike from above, whatever the heading: keypoints of their relief."""
+"""Search for submaps that look alike from above, whatever the heading, and their pose: keypoints of their relief."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -9,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Keyframe
+from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import Grid
 from umf_ros.verification.prepared_scan import PreparedScan
+from umf_ros.verification.yaw_search import lifted
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,20 +53,35 @@ def find_keypoints(relief: Grid) -> Keypoints:
     return Keypoints(places.astype(np.float32), np.sqrt(share).astype(np.float32))
 
 
-def common_keypoints(query: Keypoints, match: Keypoints) -> int:
-    """How many keypoints one planar motion takes from the query to the match; 0 without such a motion."""
+def guess_poses(query: Keyframe, matches: Sequence[Keyframe]) -> dict[int, Array]:
+    """Poses `match_T_query` of submaps that share keypoints with that of the query, by the stamp of the match."""
+    ours, guesses = PreparedScan.of(query), {}
+    keypoints = find_keypoints(ours.terrain.relief)
+    for match in matches:
+        theirs = PreparedScan.of(match)
+        count, turn, shift = common_keypoints(keypoints, find_keypoints(theirs.terrain.relief))
+        if count:
+            guesses[match.stamp_ns] = lifted(theirs, ours, turn, shift)
+    return guesses
+
+
+def common_keypoints(query: Keypoints, match: Keypoints) -> tuple[int, float, Array]:
+    """How many keypoints one planar motion takes from the query to the match, rad and (2,) m; 0 without a motion."""
+    nothing = 0, 0.0, np.zeros(2)
+    if min(len(query.places), len(match.places)) < const.MIN_KEYPOINTS:
+        return nothing
     similarity = query.descriptors @ match.descriptors.T
     there = similarity.argmax(axis=1)
     here = np.flatnonzero(similarity.argmax(axis=0)[there] == np.arange(len(there)))
     if len(here) < const.MIN_KEYPOINTS:
-        return 0
+        return nothing
     cv2.setRNGSeed(0)
     motion, inliers = cv2.estimateAffinePartial2D(
         query.places[here], match.places[there[here]], ransacReprojThreshold=2 * const.TERRAIN_CELL_M, maxIters=300
     )
     if motion is None or abs(float(np.hypot(motion[0, 0], motion[1, 0])) - 1) > const.KEYPOINT_SCALE:
-        return 0
-    return int(inliers.sum())
+        return nothing
+    return int(inliers.sum()), math.atan2(motion[1, 0], motion[0, 0]), np.asarray(motion[:, 2], float)
 
 
 class Lookalikes:
@@ -89,7 +108,7 @@ class Lookalikes:
             return []
         votes = self._votes(query, allowed)
         chosen = [int(one) for one in np.argsort(-votes, kind="stable")[: const.SUBMAPS_COMPARED] if votes[one] > 0]
-        counts = {int(allowed[one]): common_keypoints(query, self._submaps[allowed[one]]) for one in chosen}
+        counts = {int(allowed[one]): common_keypoints(query, self._submaps[allowed[one]])[0] for one in chosen}
         return [self.rows[index] for index in sorted(counts, key=lambda index: -counts[index]) if counts[index]]
 
     def _votes(self, query: Keypoints, allowed: NDArray[np.intp]) -> NDArray[np.float32]:

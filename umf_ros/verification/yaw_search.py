@@ -75,7 +75,7 @@ def search(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
         return []
     fits = []
     for index, shift in _peaks(_correlate(theirs, turned.spectra(wanted)), wanted, const.PEAKS, ours.cell_m):
-        guess = _lifted(match, turned.scan, float(const.ALL_HEADINGS[index]), shift)
+        guess = lifted(match, turned.scan, float(const.ALL_HEADINGS[index]), shift)
         fits.append(coarse_align(match, turned.scan, guess))
     return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
 
@@ -98,7 +98,7 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     row, column = np.round(level[:2, 3] / query.cell_m).astype(int) + const.MAP_SHIFT
     volumes[:, :, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
     peaks = _peaks(volumes, np.zeros(1, np.intp), const.PEAKS // 2, query.cell_m)
-    return [_by_scouts(match, query, _lifted(match, query, turn, shift)) for _, shift in peaks]
+    return [_by_scouts(match, query, lifted(match, query, turn, shift)) for _, shift in peaks]
 
 
 def _by_scouts(match: PreparedScan, query: PreparedScan, guess: Array) -> Array:
@@ -135,7 +135,7 @@ def _peaks(
     return peaks
 
 
-def _lifted(match: PreparedScan, query: PreparedScan, turn: float, shift: Array) -> Array:
+def lifted(match: PreparedScan, query: PreparedScan, turn: float, shift: Array) -> Array:
     """`match_T_query` of a planar fit, rad and (2,) m between the upright frames, with the height of the ground."""
     theirs, ours = match.map(query.cell_m), query.map(query.cell_m)
     cos, sin = math.cos(turn), math.sin(turn)
@@ -144,5 +144,5 @@ def _lifted(match: PreparedScan, query: PreparedScan, turn: float, shift: Array)
     known = offset[np.isfinite(offset)]
     if len(known):
         planar[2, 3] = np.median(known)
-    lifted: Array = invert(match.upright_T_body) @ planar @ query.upright_T_body
-    return lifted
+    found: Array = invert(match.upright_T_body) @ planar @ query.upright_T_body
+    return found

@@ -22,6 +22,7 @@ from umf_ros.lab.simulation.domains.passages import Passage
 from umf_ros.lab.simulation.domains.passages import drive as drive_passage
 from umf_ros.lab.simulation.domains.survey import FIRST, MOUNTS, OTHER_WAY, SAME_WAY
 from umf_ros.sensors.decode import Cloud
+from umf_ros.submaps.lookalikes import guess_poses
 from umf_ros.submaps.merging import DriftMeter, needed_scans, submap_of
 from umf_ros.verification import Verifier
 from umf_ros.verification import constants as const
@@ -229,7 +230,9 @@ def verified(verifier: Verifier, pair: ScanPair) -> tuple[LoopClosure | None, bo
     if closure is not None or pair.query.before is None:
         return closure, False
     verifier.reset()
-    return verifier.verify(pair.query.before, [(candidate, pair.match.around or pair.match.keyframe)])[0].closure, True
+    match = pair.match.around or pair.match.keyframe
+    guesses = guess_poses(pair.query.before, [match])
+    return verifier.verify(pair.query.before, [(candidate, match)], guesses)[0].closure, True
 
 
 def _distance(query: ScannedPlace, match: ScannedPlace) -> float:
