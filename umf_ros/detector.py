@@ -36,7 +36,8 @@ Other = TypeVar("Other")
 NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
 COUNTED_STEP_M = 0.05
 """Least motion that counts: odometry noise of a parked rover must not add up to metres (*by hand*)."""
-_NOT_EMBEDDED = Embedding(np.empty(0, np.float32))
+NOT_EMBEDDED = Embedding(np.empty(0, np.float32))
+"""Embedding of keyframes whose scan alone is used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +242,7 @@ class LoopDetector:
             raise ValueError("call select with this frame first")
         coming = self._begin(self._current)
         path_length_m = self._current.path_length_m + self._ahead_m
-        keyframe = _assemble(frame, _NOT_EMBEDDED, path_length_m, self._stored_session)
+        keyframe = assemble(frame, NOT_EMBEDDED, path_length_m, self._stored_session)
         if not coming.done() and len(self.database):
             self._verifier.prefetch(keyframe)  # in parallel with the network
         embedding, self.embed_ms = coming.result()
@@ -362,10 +363,10 @@ def make_keyframe(frame: Frame, embedder: Embedder, path_length_m: float = float
         embedder: the network.
         path_length_m: metres driven since the start of the session, NaN when unknown.
     """
-    return _assemble(frame, lift(frame, embedder.embed(frame)), path_length_m)
+    return assemble(frame, lift(frame, embedder.embed(frame)), path_length_m)
 
 
-def _assemble(frame: Frame, embedding: Embedding, path_length_m: float, session: int = 0) -> Keyframe:
+def assemble(frame: Frame, embedding: Embedding, path_length_m: float, session: int = 0) -> Keyframe:
     """Return the keyframe of a frame whose embedding is known, its scan thinned."""
     points, motion = thin_frame(frame)
     return Keyframe(

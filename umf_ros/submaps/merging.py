@@ -100,8 +100,10 @@ def _reach_m(keyframe: Keyframe) -> float:
 
 def submap_around(keyframe: Keyframe, others: Sequence[Keyframe]) -> Keyframe | None:
     """The keyframe merged with those around it on its path, by the drift that they themselves show; as `submap_of`."""
-    path = sorted([keyframe, *others], key=lambda one: one.path_length_m)
-    return submap_of(keyframe, sorted(others, key=lambda one: _way_m(keyframe, one)), drift_along(path))
+    others = sorted(others, key=lambda one: _way_m(keyframe, one))
+    if not needed_scans(keyframe, others):
+        return None
+    return submap_of(keyframe, others, drift_along(sorted([keyframe, *others], key=lambda one: one.path_length_m)))
 
 
 def drift_along(path: Sequence[Keyframe]) -> DriftMeter:

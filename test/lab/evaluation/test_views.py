@@ -8,15 +8,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recordings import CALIBRATION, traverse, write_mcap
+from recordings import CALIBRATION, CLOUD, ODOMETRY, START_NS, cloud, odometry, scan, traverse, write_mcap
+from submaps_drives import Drive, drive, rough_ground
 
 from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.core.config import Verification
 from umf_ros.core.errors import CalibrationError, UmfError
 from umf_ros.core.frames import Embedding, Frame
+from umf_ros.core.geometry import invert, make_pose, relative, transform
 from umf_ros.lab.evaluation import comparison as views
-from umf_ros.lab.evaluation.comparison import Comparer, PlaceView
+from umf_ros.lab.evaluation.comparison import Comparer, PlaceView, judge
 from umf_ros.lab.scan_files import SensorFileError
+from umf_ros.verification import Verifier
 
 
 class CountingEmbedder(ThumbnailEmbedder):
@@ -145,3 +148,38 @@ def test_a_data_set_names_its_calibration(here: Path) -> None:
     cv2.imwrite(str(here / "left.png"), np.zeros((512, 688), np.uint8))
     Comparer(embedder, Verification(), calibration=Path("simulated")).keyframe(PlaceView("", str(here / "left.png")))
     assert embedder.frames[0].camera.fx > 300
+
+
+def recorded(path: Path, outing: Drive, with_odometry: bool) -> Path:
+    """The way there and back as a recording of a LiDAR and odometry."""
+    body_T_lidar = make_pose([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], [0.2, 0.0, 0.6])
+    entries = []
+    for one in outing.keyframes:
+        assert one.odom_T_body is not None
+        stamp = START_NS + one.stamp_ns
+        records = scan(transform(invert(body_T_lidar), one.points.astype(float)))
+        entries += [(CLOUD, stamp + 2_000_000, cloud(stamp, records))]
+        for moment in (stamp - 10_000_000, stamp, stamp + 10_000_000) if with_odometry else ():
+            entries += [(ODOMETRY, moment + 1_000_000, odometry(moment, one.odom_T_body))]
+    return write_mcap(path, sorted(entries, key=lambda entry: entry[1]))
+
+
+@pytest.mark.parametrize("with_odometry", [True, False])
+def test_frames_seen_from_opposite_sides_by_a_narrow_lidar_are_compared_as_submaps(
+    tmp_path: Path, with_odometry: bool
+) -> None:
+    outing = drive(rough_ground(5))
+    (tmp_path / "calibration.yaml").write_text(CALIBRATION.replace("offset_s: 0.1", "offset_s: 0.0"))
+    bag = recorded(tmp_path / "drive.mcap", outing, with_odometry)
+    there, back, near = 18, len(outing.keyframes) - 18, 22
+    source = Comparer(ThumbnailEmbedder(), Verification(), calibration=tmp_path / "calibration.yaml")
+    views = [PlaceView(f"{bag}@{START_NS + outing.keyframes[row].stamp_ns}") for row in (there, back, near)]
+    source.expect(views)
+    row = source.compare(*views[:2])
+    assert row["accepted"] == with_odometry
+    if with_odometry:
+        true = relative(outing.truth[there], outing.truth[back])
+        assert np.hypot(row["x"] - true[0, 3], row["y"] - true[1, 3]) < 0.5 and abs(row["qz"]) > 0.99
+    # submaps of neighbours hold the same scans: they are compared by their own
+    alone = judge(Verifier(Verification()), source.keyframe(views[0]), source.keyframe(views[2]))
+    assert source.compare(views[0], views[2])["probability"] == pytest.approx(alone.probability, abs=1e-6)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -16,12 +16,13 @@ import numpy as np
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
-from umf_ros.core.config import Verification
+from umf_ros.core.config import KeyframePolicy, Verification
 from umf_ros.core.errors import BagError, ConfigError, UmfError, writing
 from umf_ros.core.frames import Candidate, Frame, Image, Keyframe, LoopClosure, Points
 from umf_ros.core.geometry import transform
-from umf_ros.detector import make_keyframe
+from umf_ros.detector import NOT_EMBEDDED, KeyframeSelector, assemble, make_keyframe
 from umf_ros.embedding import Embedder
+from umf_ros.embedding.depth import lift
 from umf_ros.lab.scan_files import (
     OUT_OF_REACH,
     UNCALIBRATED,
@@ -33,14 +34,18 @@ from umf_ros.lab.scan_files import (
 )
 from umf_ros.runs.run_file import pose_numbers
 from umf_ros.sensors.calibration import load_calibration
+from umf_ros.submaps.history import can_be_merged
+from umf_ros.submaps.lookalikes import guess_poses
+from umf_ros.submaps.merging import submap_around
 from umf_ros.verification import Hypothesis, Verifier
+from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance
 from umf_ros.verification.pose_search import consistent_pixels
 
 NO_CALIBRATION = "no calibration: images alone give no pose without one"
 NO_DEPTH = "no depth: images without a scan or a right image give no metric pose"
 CACHED_KEYFRAMES = 1000
-"""Keyframes in memory, of a fifth of a megabyte each."""
+"""Keyframes in memory, of up to two fifths of a megabyte each with their submap."""
 FRAMES_AT_ONCE = 100
 """Frames with their images that one pass through a recording collects."""
 REACH_NS = 10**9
@@ -58,6 +63,8 @@ RESULT_COLUMNS = ("accepted", "probability", *POSE, *SIGMA, "reason", "milliseco
 """`match_T_query` in m, its standard deviations in m and rad about the axes of the match body."""
 
 Pair = tuple["PlaceView", "PlaceView"]
+Seen = tuple[Keyframe, Keyframe | None]
+"""A keyframe, and its submap where its scan shows too little."""
 Row = dict[str, Any]
 
 
@@ -122,7 +129,7 @@ class Comparer:
         self._warn = cache(warn)
         self._named = None if calibration is None else str(calibration)
         self._calibration = UNCALIBRATED if calibration is None else load_calibration(str(calibration))
-        self._cache: OrderedDict[PlaceView, Keyframe | UmfError] = OrderedDict()
+        self._cache: OrderedDict[PlaceView, Seen | UmfError] = OrderedDict()
         self._expected: dict[Path, list[PlaceView]] = {}
 
     def expect(self, views: Iterable[PlaceView]) -> None:
@@ -133,18 +140,25 @@ class Comparer:
                 self._expected.setdefault(reference[0], []).append(view)
 
     def compare(self, match: PlaceView, query: PlaceView) -> Row:
-        """Compare two views and return the values of `RESULT_COLUMNS`.
+        """Compare two views, and their submaps where the scans give no pose; return the values of `RESULT_COLUMNS`.
 
         Raises:
             UmfError: one of them cannot be read; says which.
         """
-        keyframes = self._read("match", match), self._read("query", query)
+        (their_scan, their_submap), (our_scan, our_submap) = self._read("match", match), self._read("query", query)
+        keyframes = their_scan, our_scan
         similarity = similarity_of(*keyframes)
         if self._named is None and not (match.scan and query.scan):
             return result_row(NO_CALIBRATION, similarity, 0.0)
         verdict = judge(self._verifier, *keyframes)
+        elapsed_ms = sum(self._verifier.latency_ms.values())
+        merged = their_submap or their_scan, our_submap or our_scan
+        submaps = (their_submap or our_submap) is not None and not _share_scans(match, query, *merged)
+        if verdict.closure is None and submaps:
+            verdict = judge(self._verifier, *merged, submaps=True)
+            elapsed_ms += sum(self._verifier.latency_ms.values())
         blind = verdict.closure is None and not any(keyframe.has_depth for keyframe in keyframes)
-        reason, elapsed_ms = NO_DEPTH if blind else verdict.outcome, sum(self._verifier.latency_ms.values())
+        reason = NO_DEPTH if blind else verdict.outcome
         return result_row(reason, similarity, elapsed_ms, verdict.probability, verdict.closure)
 
     def keyframe(self, view: PlaceView) -> Keyframe:
@@ -153,12 +167,15 @@ class Comparer:
         Raises:
             UmfError: it cannot be read.
         """
+        return self._load(view)[0]
+
+    def _load(self, view: PlaceView) -> Seen:
         if view not in self._cache:
             try:
                 if reference := split_reference(view.scan):
                     self._read_recording(reference[0], view)
                 else:
-                    self._cache[view] = self._from_files(view)
+                    self._cache[view] = self._from_files(view), None
             except UmfError as error:
                 self._cache[view] = error
         self._cache.move_to_end(view)
@@ -169,9 +186,9 @@ class Comparer:
             raise found
         return found
 
-    def _read(self, role: str, view: PlaceView) -> Keyframe:
+    def _read(self, role: str, view: PlaceView) -> Seen:
         try:
-            return self.keyframe(view)
+            return self._load(view)
         except UmfError as error:
             raise SensorFileError(f"{role}: {error}") from None
 
@@ -191,7 +208,7 @@ class Comparer:
         return keyframe
 
     def _read_recording(self, path: Path, view: PlaceView) -> None:
-        """Keep the keyframe of a frame, and of the frames of its recording that are expected next."""
+        """Keep the keyframe and submap of a frame, and of the frames of its recording that are expected next."""
         expected, wanted = self._expected.get(path, []), {view: view.moment}
         start = expected.index(view) if view in expected else 0
         for one in expected[start : start + FRAMES_AT_ONCE]:
@@ -199,22 +216,84 @@ class Comparer:
                 wanted[one] = one.moment
         bag = open_bag(path)
         settings = settings_for(bag, self._config, self._dataset, calibration=self._named)
-        found = nearest_frames(FrameReader(bag, settings, warn=self._warn), list(wanted.values()))
+        along = _ScansOnPath(settings.keyframe)
+        frames = along.record(FrameReader(bag, settings, warn=self._warn))
+        found = nearest_frames(frames, list(wanted.values()))
+        along.read_on(frames)
         for one, frame in zip(wanted, found, strict=True):
             try:
-                self._cache[one] = frame if isinstance(frame, UmfError) else make_keyframe(frame, self._embedder)
+                self._cache[one] = frame if isinstance(frame, UmfError) else along.seen_at(frame, self._embedder)
             except UmfError as error:
                 self._cache[one] = error
 
 
-def judge(verifier: Verifier, match: Keyframe, query: Keyframe) -> Hypothesis:
-    """Verify one pair of keyframes without odometry and without the support of earlier pairs."""
+class _ScansOnPath:
+    """Keeps the scans that may be merged while the frames of a recording pass, one of every `MERGE_STEP_M`."""
+
+    def __init__(self, policy: KeyframePolicy) -> None:
+        self._selector = KeyframeSelector(policy)
+        self._scans: list[Keyframe] = []
+        self._path_m: dict[int, float] = {}
+
+    def record(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """Yield frames unchanged."""
+        for frame in frames:
+            self._selector.select(frame)
+            path_m = self._path_m[frame.stamp_ns] = self._selector.path_length_m(frame)
+            last = self._scans[-1] if self._scans else None
+            due = last is None or last.session != frame.session or path_m - last.path_length_m >= const.MERGE_STEP_M
+            if due and frame.odom_T_body is not None and frame.points is not None:
+                scan = assemble(frame, NOT_EMBEDDED, path_m, frame.session)
+                self._scans += [scan] if can_be_merged(scan) else []
+            yield frame
+
+    def read_on(self, frames: Iterator[Frame]) -> None:
+        """Record as many metres more as a submap holds."""
+        end_m = list(self._path_m.values())[-1] + const.ODOMETRY_REACH_M
+        while (frame := next(frames, None)) is not None and self._path_m[frame.stamp_ns] < end_m:
+            pass
+
+    def seen_at(self, frame: Frame, embedder: Embedder) -> Seen:
+        """Return the keyframe of a recorded frame, and its submap where it needs one."""
+        embedding = lift(frame, embedder.embed(frame))
+        keyframe = assemble(frame, embedding, self._path_m[frame.stamp_ns], frame.session)
+        if not can_be_merged(keyframe):
+            return keyframe, None
+        away = [(abs(one.path_length_m - keyframe.path_length_m), one) for one in self._scans]
+        near = [one for metres, one in away if 0 < metres <= const.ODOMETRY_REACH_M and one.session == frame.session]
+        return keyframe, submap_around(keyframe, near)
+
+
+def _share_scans(match: PlaceView, query: PlaceView, theirs: Keyframe, ours: Keyframe) -> bool:
+    """Whether submaps of one recording may hold the same scans, which are alike for no other reason."""
+    one, other = split_reference(match.scan), split_reference(query.scan)
+    if one is None or other is None or one[0] != other[0] or theirs.session != ours.session:
+        return False
+    return abs(theirs.path_length_m - ours.path_length_m) < 2 * const.ODOMETRY_REACH_M
+
+
+def judge(
+    verifier: Verifier,
+    match: Keyframe,
+    query: Keyframe,
+    submaps: bool = False,
+) -> Hypothesis:
+    """Verify one pair of keyframes without odometry and without the support of earlier pairs.
+
+    Args:
+        verifier: its memory is cleared.
+        match: the earlier one.
+        query: the later one.
+        submaps: whether their keypoints give a first pose.
+    """
     match, query = (
         replace(keyframe, stamp_ns=stamp_ns, odom_T_body=None, path_length_m=float("nan"), session=0)
         for stamp_ns, keyframe in enumerate((match, query), 1)
     )
     verifier.reset()
-    return verifier.verify(query, [(Candidate(0, match.stamp_ns, similarity_of(match, query)), match)])[0]
+    candidate = Candidate(0, match.stamp_ns, similarity_of(match, query))
+    guesses = guess_poses(query, [match]) if submaps else {}
+    return verifier.verify(query, [(candidate, match)], guesses)[0]
 
 
 def similarity_of(match: Keyframe, query: Keyframe) -> float:
