@@ -7,8 +7,11 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import rasterio
+import yaml
 from command_line import Ended, only_line, umf
 from recordings import part_of
 
@@ -122,8 +125,32 @@ def test_the_map_is_a_point_cloud_too(made: tuple[Path, Ended]) -> None:
     assert len(parse_pcd((out / "map.pcd").read_bytes())["x"]) == len(columns["x"])
     assert (out / "map.png").read_bytes().startswith(b"\x89PNG")
     thickness = json.loads((out / "summary.json").read_text())["thickness_m"]
-    assert thickness["after"] < 0.15
+    assert thickness["after"] < 0.15 and thickness["after"] <= thickness["with_moving"] + 0.001
     assert "cm thick" in ended.text
+
+
+def test_the_ground_is_written_for_navigation_with_any_limits(made: tuple[Path, Ended], tmp_path: Path) -> None:
+    out, _ = made
+    assert not (out / "trajectories.geojson").exists()  # there is no origin
+    about = yaml.safe_load((out / "map.yaml").read_text())
+    grid = cv2.imread(str(out / about["image"]), cv2.IMREAD_UNCHANGED)
+    assert (grid == 254).sum() > 3 * (grid == 0).sum() > 0
+    (tmp_path / "tight.yaml").write_text("/**: {ros__parameters: {terrain: {max_step_m: 0.1, cell_m: 0.25}}}\n")
+    ended = umf("map", "export", out, "--config", tmp_path / "tight.yaml", "--out", tmp_path / "tight")
+    assert ended.status == 0 and "elevation.tif" in ended.text
+    tight = cv2.imread(str(tmp_path / "tight" / "map.pgm"), cv2.IMREAD_UNCHANGED)
+    assert yaml.safe_load((tmp_path / "tight" / "map.yaml").read_text())["resolution"] == 0.25
+    assert (tight == 0).mean() > (grid == 0).mean()
+    with rasterio.open(tmp_path / "tight" / "elevation.tif") as file:
+        assert file.shape == tight.shape and file.crs is None
+    assert "is not a map" in only_line(umf("map", "export", tmp_path))
+    assert "max_step_m" in only_line(umf("map", "export", out, "--config", wrong_limits(tmp_path)))
+
+
+def wrong_limits(folder: Path) -> Path:
+    path = folder / "wrong.yaml"
+    path.write_text("/**: {ros__parameters: {terrain: {max_step_m: -1.0}}}\n")
+    return path
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 import csv
 import json
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,11 +8,14 @@ import numpy as np
 import pytest
 from maps_made import MadeSession, made_map, on_circle, tie
 
-from umf_ros.core.geometry import transform
+from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
+from umf_ros.core.config import Settings
+from umf_ros.core.geometry import from_enu, make_pose, to_enu, transform
 from umf_ros.localizer import read_poses
 from umf_ros.maps.joint_graph import JointMap, solve
 from umf_ros.maps.outputs import write_results
 from umf_ros.pose_graph.closures import State
+from umf_ros.runs.run_file import RunFile
 from umf_ros.runs.truth import absolute_trajectory_error
 
 DAY_NS = 86_400 * 10**9
@@ -120,3 +124,25 @@ def test_the_largest_part_is_the_map_wherever_the_first_session_is(tmp_path: Pat
     assert [one.joined for one in joint.sessions] == [False, True, True]
     there = transform(np.linalg.inv(on_circle(np.array([0]))[0]), first.truth[:, :3, 3])
     assert np.abs(joint.sessions[1].poses[:, :3, 3] - there).max() < 2
+
+
+def test_fixes_of_a_recording_put_the_map_on_earth(tmp_path: Path) -> None:
+    made, origin = two(), np.array([37.75, 14.99, 1800.0])
+    folder = made_map(tmp_path / "map", list(made), Settings(pose_graph={"origin": "37.75 14.99 1800"}))
+    turn = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [30.0, 20.0, 2.0])
+    for one in made:
+        fixes = from_enu(transform(turn, one.truth[:, :3, 3]), origin)
+        with closing(RunFile(folder.folder_of(one.name))) as file:
+            for row, fix in enumerate(fixes):
+                stamp = one.stamp(one.first_m + row)
+                file.append_absolute(row + 1, AbsoluteMeasurement(Aid.GNSS, stamp, fix, 0.01 * np.eye(3), np.zeros(3)))
+    joint = solve(folder)
+    assert joint.world is not None
+    write_results(folder, joint)
+    lines = {
+        one["properties"]["name"]: np.array(one["geometry"]["coordinates"])
+        for one in json.loads((folder.path / "trajectories.geojson").read_text())["features"]
+    }
+    for one in made:
+        found = to_enu(lines[one.name][:, [1, 0, 2]], origin)
+        assert np.linalg.norm(found - transform(turn, one.truth[:, :3, 3]), axis=1).max() < 1.0

@@ -151,6 +151,12 @@ class AbsoluteReference:
             for component in sorted(set(paths.components)):
                 self._judge_heights(self._model, component, paths, solve, at_last)
 
+    def world_of(self, component: int, paths: Sessions) -> tuple[Array, Array] | None:
+        """Return `world_T_map` of a component and the origin; None where neither GNSS nor an elevation model fits."""
+        heights = self._heights.get(component)
+        is_placed = self._has_gnss(component, paths) or (heights is not None and heights.fits)
+        return (self.worlds[component], self.origin) if is_placed and self.origin is not None else None
+
     def verdicts(self) -> list[AbsoluteVerdict]:
         """The latest verdict of every measurement."""
         waiting = State.PENDING, AbsoluteReason.NO_ODOMETRY_YET

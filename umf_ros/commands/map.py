@@ -44,15 +44,21 @@ Pair = Annotated[
 ]
 
 
+COMMANDS = ("edit", "grow", "export")
+
+
 class _MakeOrChange(TyperGroup):
-    """`umf map RECORDINGS` makes a map; `umf map edit` and `umf map grow` are the commands beside that."""
+    """`umf map RECORDINGS` makes a map; `COMMANDS` are those beside that."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Name the usual command where none is named."""
-        return super().parse_args(ctx, args if args[:1] in (["edit"], ["grow"]) else ["make", *args])
+        return super().parse_args(ctx, args if args and args[0] in COMMANDS else ["make", *args])
 
 
-ALSO = "umf map edit decides about closures of a map by hand, umf map grow adds a drive that localised in it."
+ALSO = (
+    "umf map edit decides about closures of a map by hand, umf map grow adds a drive that localised in it, "
+    "umf map export writes the map of the ground for other limits of a rover."
+)
 app = typer.Typer(cls=_MakeOrChange, rich_markup_mode="rich")
 
 
@@ -158,6 +164,28 @@ def grow_map(
     if session is None:
         console.print(f"{run}: nothing new for the map", markup=False, soft_wrap=True)
     _print_summary(map_folder, summary, console)
+
+
+@app.command("export")
+def export(
+    map_folder: Annotated[Path, typer.Argument(help="Folder of the map.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the files; the map's by default.")] = None,
+    config: ConfigPath = None,
+) -> None:
+    """Write where a rover can drive, as map.yaml and map.pgm for Nav2's map server, and the elevation as a GeoTIFF.
+
+    The parameters terrain.* of --config are the limits of the rover; without it, they are those of the map.
+    """
+    from umf_ros.core.config import load_settings
+    from umf_ros.core.io import check_writable
+    from umf_ros.maps.map_folder import MapFolder
+    from umf_ros.maps.point_cloud import export_terrain
+
+    target, folder = MapFolder.open(map_folder), out or map_folder
+    settings = (load_settings(config) if config else target.settings).terrain
+    check_writable(folder)
+    missing = export_terrain(target, settings, folder)
+    typer.echo(f"{folder}: map.yaml, map.pgm" + (f"; {missing}" if missing else ", elevation.tif"))
 
 
 def _new_recordings(target: MapFolder, recordings: list[Path], console: Console) -> dict[str, Path]:

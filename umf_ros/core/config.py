@@ -200,6 +200,19 @@ class LocalizationSettings(Group):
     )
 
 
+class TerrainSettings(Group):
+    """The map of the ground: limits of the rover, and bounds of what is published."""
+
+    cell_m: float = Field(0.2, ge=0.05, le=2, description="side of voxels and of cells of the grid, m")
+    footprint_m: float = Field(1.0, gt=0, le=10, description="width of the ground under the rover, m")
+    max_slope_deg: float = Field(20.0, gt=0, lt=90, description="steepest ground that is free, deg")
+    max_step_m: float = Field(0.25, gt=0, description="highest step between neighbouring cells that is free, m")
+    max_roughness_m: float = Field(0.1, gt=0, description="largest deviation of the ground from a plane, m")
+    clearance_m: float = Field(2.0, gt=0, description="height above the ground from which on nothing is in the way, m")
+    period_s: float = Field(2.0, gt=0, description="shortest time between two publications, s")
+    max_bytes_per_s: float = Field(1e6, gt=0, description="largest mean rate of cloud and grid together, bytes/s")
+
+
 class FrameIds(Group):
     """Names of the coordinate frames (REP-105)."""
 
@@ -260,6 +273,7 @@ class Settings(Group):
     loop: Loop = Loop()
     verification: Verification = Verification()
     pose_graph: PoseGraphSettings = PoseGraphSettings()
+    terrain: TerrainSettings = TerrainSettings()
     frames: FrameIds = FrameIds()
     database: Database = Database()
     worker: WorkerSettings = WorkerSettings()

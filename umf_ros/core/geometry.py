@@ -178,6 +178,13 @@ def evenly(count: int, most: int) -> NDArray[np.intp]:
     return np.linspace(0, count - 1, min(count, most)).astype(np.intp)
 
 
+def cubes(points: Array, cell_m: float) -> NDArray[np.int64]:
+    """Return (N,) numbers of the cubes with sides of `cell_m` that points (N, 3) lie in, rising with x first."""
+    row, column, layer = (np.floor(points / cell_m).astype(np.int64) + 2**20).T
+    found: NDArray[np.int64] = (row << 42) + (column << 21) + layer
+    return found
+
+
 _RADIUS_M, _ECCENTRICITY2 = 6_378_137.0, 6.694379990141e-3
 """Semi-major axis, and first eccentricity squared."""
 

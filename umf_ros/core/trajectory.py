@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from umf_ros.core.errors import writing
-from umf_ros.core.geometry import Array, interpolate, to_quaternion
+from umf_ros.core.geometry import Array, from_enu, interpolate, to_quaternion, transform
+from umf_ros.core.io import write_atomically
 
 MAX_GAP_S = 2.0
 """Longest gap that poses are interpolated across."""
@@ -105,6 +107,27 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     lines = [form % (*stamp, *row) for stamp, row in zip(stamps, numbers, strict=True)]
     with writing(path):
         Path(path).write_text("".join(lines), encoding="ascii")
+
+
+def write_geojson(path: Path, trajectories: Mapping[str, Array], world_T_map: Array, origin: Array) -> None:
+    """Write trajectories by name as line strings of a GeoJSON file (RFC 7946); those of one pose are left out.
+
+    Args:
+        path: the file.
+        trajectories: (N, 4, 4) `map_T_body` each.
+        world_T_map: (4, 4) pose of their frame in axes east, north and up of the origin.
+        origin: (3,) latitude, longitude (deg) and height (m) on WGS 84.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    features = []
+    for name, poses in trajectories.items():
+        if len(poses) > 1:
+            degrees = from_enu(transform(world_T_map, poses[:, :3, 3]), origin)[:, [1, 0, 2]]
+            line = {"type": "LineString", "coordinates": degrees.round(9).tolist()}
+            features.append({"type": "Feature", "properties": {"name": name}, "geometry": line})
+    write_atomically(path, json.dumps({"type": "FeatureCollection", "features": features}) + "\n")
 
 
 EDGE = np.dtype([("first", "i8"), ("second", "i8"), ("pose", "f8", (4, 4)), ("covariance", "f8", (6, 6))])

@@ -48,12 +48,14 @@ class JointMap:
         sessions: its recordings.
         within: verdicts on closures within a recording.
         between: verdicts on closures between two recordings.
+        world: `world_T_map` and the origin on WGS 84; None without a reference.
     """
 
     graph: PoseGraph
     sessions: list[JointSession]
     within: list[ClosureVerdict]
     between: list[ClosureVerdict]
+    world: tuple[Array, Array] | None
 
     def accepted_between(self) -> list[LoopClosure]:
         """Return accepted closures between recordings."""
@@ -76,6 +78,8 @@ def solve(folder: MapFolder, edits: Mapping[tuple[int, int], State] | None = Non
         if number:
             graph.begin_session()
         feed(graph, (one._replace(stamp_ns=one.stamp_ns + session.shift_ns) for one in odometry[session.name]))
+        for one in folder.measurements_of(session.name):
+            graph.add_absolute(replace(one, stamp_ns=one.stamp_ns + session.shift_ns))
     # after all odometry, as a closure may refer to any session
     for session in folder.sessions:
         run = folder.folder_of(session.name)
@@ -90,7 +94,7 @@ def solve(folder: MapFolder, edits: Mapping[tuple[int, int], State] | None = Non
         query, match = (folder.session_at(stamp) for stamp in ends)
         verdicts[query is not match].append(verdict)
     sessions = [_placed(folder, session, graph, odometry[session.name]) for session in folder.sessions]
-    return JointMap(graph, sessions, *verdicts)
+    return JointMap(graph, sessions, *verdicts, graph.world())
 
 
 def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, odometry: list[StoredOdometry]) -> JointSession:

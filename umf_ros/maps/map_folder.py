@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError, reading, writing
 from umf_ros.core.frames import State
@@ -111,6 +112,11 @@ class MapFolder:
         """Return the odometry of a recording, stamped by its own clock."""
         with closing(RunFile(self.folder_of(name), read_only=True)) as file:
             return list(file.odometry())
+
+    def measurements_of(self, name: str) -> list[AbsoluteMeasurement]:
+        """Return the absolute measurements of a recording, stamped by its own clock."""
+        with closing(RunFile(self.folder_of(name), read_only=True)) as file:
+            return [one for one in file.graph_inputs() if isinstance(one, AbsoluteMeasurement)]
 
     def session_at(self, map_ns: int) -> MapSession | None:
         """Return the recording that covers a stamp of the map's clock."""

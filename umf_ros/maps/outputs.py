@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex
 
 from umf_ros.core.errors import writing
 from umf_ros.core.io import atomic_write, write_atomically
-from umf_ros.core.trajectory import Trajectory, write_tum
+from umf_ros.core.trajectory import Trajectory, write_geojson, write_tum
 from umf_ros.localizer import POSES
 from umf_ros.maps.joint_graph import JointMap, JointSession
 from umf_ros.maps.map_folder import MapFolder
@@ -22,6 +22,8 @@ from umf_ros.maps.point_cloud import write_cloud
 from umf_ros.pose_graph.closures import State, verdict_table
 from umf_ros.runs.gallery import data_address
 from umf_ros.runs.report import plot_trajectories, render
+
+THICKNESS = ("before", "with_moving", "after")
 
 
 def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
@@ -36,9 +38,14 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
         write_tum(trajectories / f"{one.session.name}.tum", Trajectory(one.stamps, one.poses))
     joint.graph.write_g2o(path / "graph.g2o")
     _draw(path / "trajectories.png", joint)
-    thickness = write_cloud(folder, joint) if folder.places.is_file() else (nan, nan)
-    before, after = (None if isnan(value) else round(value, 4) for value in thickness)
-    summary = summarise(joint) | {"thickness_m": {"before": before, "after": after}}
+    found = write_cloud(folder, joint) if folder.places.is_file() else dict.fromkeys(THICKNESS, nan)
+    thickness = {name: None if isnan(value) else round(value, 4) for name, value in found.items()}
+    summary = summarise(joint) | {"thickness_m": thickness, "world": None}
+    if joint.world is not None:
+        world_T_map, origin = joint.world
+        summary["world"] = {"origin": origin.tolist(), "world_T_map": world_T_map.tolist()}
+        paths = {one.session.name: one.poses for one in joint.sessions}
+        write_geojson(path / "trajectories.geojson", paths, world_T_map, origin)
     write_atomically(path / "summary.json", json.dumps(summary, indent=2) + "\n")
     _write_report(path, summary)
     return summary

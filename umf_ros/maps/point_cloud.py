@@ -1,7 +1,8 @@
-"""The map as a point cloud: aligned scans, thinned by voxels, and the thickness of their surfaces."""
+"""The map as a point cloud: aligned scans without moving objects, thinned, and the thickness of their surfaces."""
 
 from __future__ import annotations
 
+import json
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,17 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from umf_ros.core.config import TerrainSettings
+from umf_ros.core.errors import UmfError, reading
 from umf_ros.core.frames import Points
-from umf_ros.core.geometry import evenly, invert, transform
+from umf_ros.core.geometry import Array, cubes, evenly, invert, transform
 from umf_ros.core.io import atomic_write
+from umf_ros.localizer import read_poses
 from umf_ros.maps.joint_graph import JointMap
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import stored_identity
 from umf_ros.runs.gallery import HeightMap
+from umf_ros.terrain.export import write_terrain
+from umf_ros.terrain.voxels import REACH_M, PlacedScan, VoxelMap
 
 VOXEL_M = 0.1
-REACH_M = 25.0  # by hand: beyond, points are too sparse to show an alignment
+Poses = dict[int, Array]
 _NEIGHBOURS_M, _FEWEST = 0.5, 12
 _MOST_PROBED = 20_000
 _RECORD = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("session", "u1")])
@@ -40,10 +46,7 @@ class MapCloud:
 
     def thinned(self, voxel_m: float = VOXEL_M) -> MapCloud:
         """Keep the first point in every voxel."""
-        cells = np.floor(self.points / voxel_m).astype(np.int64)
-        cells -= cells.min(axis=0, initial=0)
-        size = cells.max(axis=0, initial=0) + 1
-        _, first = np.unique((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_index=True)
+        _, first = np.unique(cubes(self.points.astype(float), voxel_m), return_index=True)
         return MapCloud(self.points[first], self.sessions[first])
 
     def thickness(self) -> float:
@@ -62,31 +65,44 @@ class MapCloud:
         return float(np.median(found)) if found else float("nan")
 
 
-def gather(folder: MapFolder, joint: JointMap, optimised: bool = True) -> MapCloud:
-    """Return the scans of all joined recordings at their poses in the map, or at those of their odometry alone."""
-    points, sessions = [np.empty((0, 3), np.float32)], [np.empty(0, np.uint8)]
+def gather(folder: MapFolder, poses: Poses) -> tuple[list[PlacedScan], NDArray[np.uint8]]:
+    """Return the scans of a map at poses `map_T_body` by their stamps on its clock, and the session of each."""
+    scans, sessions = [], []
     with closing(PlaceDatabase.of_map(folder.path, *stored_identity(folder.places))) as places:
-        for number, one in enumerate(joint.sessions):
-            poses = one.poses
-            if len(poses) and not optimised:
-                poses = poses[0] @ invert(one.odometry[0]) @ one.odometry
-            known = dict(zip((one.stamps + one.session.shift_ns).tolist(), poses, strict=True))
-            for row in range(one.session.first_place, one.session.first_place + one.session.places):
+        for number, one in enumerate(folder.sessions):
+            for row in range(one.first_place, one.first_place + one.places):
                 keyframe = places[row]
-                if keyframe.stamp_ns in known:
-                    near = keyframe.points[np.linalg.norm(keyframe.points, axis=1) < REACH_M]
-                    points.append(transform(known[keyframe.stamp_ns], near))
-                    sessions.append(np.full(len(near), number % 256, np.uint8))
-    return MapCloud(np.concatenate(points), np.concatenate(sessions))
+                if keyframe.stamp_ns in poses:
+                    scans.append((keyframe.points, keyframe.body_T_lidar, poses[keyframe.stamp_ns]))
+                    sessions.append(number % 256)
+    return scans, np.array(sessions, np.uint8)
 
 
-def write_cloud(folder: MapFolder, joint: JointMap) -> tuple[float, float]:
-    """Write `map.ply`, `map.pcd` and the picture `map.png`.
+def merge(scans: list[PlacedScan], sessions: NDArray[np.uint8]) -> MapCloud:
+    """Return the points of scans, each with its session, in one cloud."""
+    placed = [transform(pose, points[np.linalg.norm(points, axis=1) < REACH_M]) for points, _, pose in scans]
+    count = [len(points) for points in placed]
+    return MapCloud(np.concatenate([np.empty((0, 3), np.float32), *placed]), np.repeat(sessions, count))
+
+
+def write_cloud(folder: MapFolder, joint: JointMap) -> dict[str, float]:
+    """Write `map.ply`, `map.pcd`, the picture `map.png` and the files of `write_terrain`.
 
     Returns:
-        Thickness of surfaces in m by the odometry of every session alone, and by the joint graph.
+        Thickness of surfaces in m: "before", by the odometry of every session alone; "with_moving", by the joint graph;
+        "after", without moving objects.
     """
-    cloud = gather(folder, joint)
+    solved, driven = Poses(), Poses()
+    for one in joint.sessions:
+        stamps = (one.stamps + one.session.shift_ns).tolist()
+        solved |= zip(stamps, one.poses, strict=True)
+        if stamps:
+            driven |= zip(stamps, one.poses[0] @ invert(one.odometry[0]) @ one.odometry, strict=True)
+    scans, sessions = gather(folder, solved)
+    everything, voxels = merge(scans, sessions), VoxelMap(folder.settings.terrain.cell_m)
+    voxels.add(scans)
+    static = voxels.are_static(everything.points.astype(float))
+    cloud = MapCloud(everything.points[static], everything.sessions[static])
     thin = cloud.thinned()
     write_ply(folder.path / "map.ply", thin)
     write_pcd(folder.path / "map.pcd", thin)
@@ -98,7 +114,24 @@ def write_cloud(folder: MapFolder, joint: JointMap) -> tuple[float, float]:
         if png is not None:
             with atomic_write(folder.path / "map.png") as part:
                 part.write_bytes(png)
-    return gather(folder, joint, optimised=False).thinned().thickness(), thin.thickness()
+    write_terrain(folder.path, voxels.points().astype(float), folder.settings.terrain, joint.world)
+    before = merge(*gather(folder, driven)).thinned().thickness()
+    return {"before": before, "with_moving": everything.thinned().thickness(), "after": thin.thickness()}
+
+
+def export_terrain(folder: MapFolder, settings: TerrainSettings, out: Path) -> str:
+    """Write the files of the ground of a solved map into a folder; return what could not be written, as a sentence.
+
+    Raises:
+        UmfError: the map has not been solved.
+        OutputError: a file cannot be written.
+    """
+    solved, voxels = read_poses(folder.path), VoxelMap(settings.cell_m)
+    voxels.add(gather(folder, Poses(zip(solved.stamps_ns.tolist(), solved.poses, strict=True)))[0])
+    with reading(folder.path / "summary.json", UmfError, "is damaged"):
+        world = json.loads((folder.path / "summary.json").read_text(encoding="utf-8")).get("world")
+    placed = None if world is None else (np.array(world["world_T_map"]), np.array(world["origin"]))
+    return write_terrain(out, voxels.points().astype(float), settings, placed)
 
 
 def write_ply(path: Path, cloud: MapCloud) -> None:

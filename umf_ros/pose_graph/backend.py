@@ -18,7 +18,7 @@ from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError, writing
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, gtsam_to_ros_covariance, invert
-from umf_ros.core.trajectory import Trajectory, write_g2o, write_tum
+from umf_ros.core.trajectory import Trajectory, write_g2o, write_geojson, write_tum
 from umf_ros.pose_graph.closures import (
     ClosureReason,
     ClosureVerdict,
@@ -316,6 +316,10 @@ class PoseGraph:
                 known |= covered
         return poses, known
 
+    def world(self) -> tuple[Array, Array] | None:
+        """Return `world_T_map` of the largest part of the map and the origin on WGS 84; None without a reference."""
+        return self.reference.world_of(self._sessions.largest, self._sessions)
+
     def sessions_of_map(self) -> list[int]:
         """Return numbers of the sessions in the largest part of the map, by the order in which they began."""
         return self._sessions.members(self._sessions.largest)
@@ -393,6 +397,10 @@ class PoseGraph:
             (folder / "graph_verdicts.csv").write_text(verdict_table(self.closures()), encoding="utf-8")
         if absolute := self.reference.verdicts():
             write_verdicts(folder / "absolute_verdicts.csv", absolute)
+        if (world := self.world()) is not None:
+            chains = {session: self._sessions.chains[session] for session in self.sessions_of_map()}
+            paths = {f"session {number}": self._sessions.at(one.at(one.stamps)) for number, one in chains.items()}
+            write_geojson(folder / "trajectories.geojson", paths, *world)
         self.write_tum(folder / "trajectory_odometry.tum", optimized=False)
         self.write_tum(folder / "trajectory_optimized.tum")
         self.write_g2o(folder / "graph.g2o")

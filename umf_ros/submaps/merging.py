@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Keyframe, ScanMotion
-from umf_ros.core.geometry import Array, heading, relative, transform
+from umf_ros.core.geometry import Array, cubes, heading, relative, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.prepared_scan import PreparedScan, cubes
+from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import align_scans
 
 

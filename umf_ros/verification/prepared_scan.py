@@ -12,7 +12,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Frame, Keyframe, Points, ScanMotion
-from umf_ros.core.geometry import Array, evenly, invert, make_pose, transform
+from umf_ros.core.geometry import Array, cubes, evenly, invert, make_pose, transform
 from umf_ros.core.levelling import upright
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import GridMap
@@ -42,13 +42,6 @@ def _cell_means(points: Points, values: Points) -> Points:
     _, owner, count = np.unique(cubes(near, const.THIN_CELL_M), return_inverse=True, return_counts=True)
     means = [np.bincount(owner, column) / count for column in values.T]
     return np.column_stack(means).astype(np.float32)
-
-
-def cubes(points: Array, cell_m: float) -> NDArray[np.int64]:
-    """(N,) numbers of the cubes with sides of `cell_m` that points (N, 3) lie in."""
-    row, column, layer = (np.floor(points / cell_m).astype(np.int64) + 2**20).T
-    found: NDArray[np.int64] = (row << 42) + (column << 21) + layer
-    return found
 
 
 @dataclass(frozen=True)
