@@ -37,6 +37,7 @@ setup(
             "umf = umf_ros.cli:main",
             "loop_closure_node = umf_ros.nodes.start:loop_closure_node",
             "pose_graph_node = umf_ros.nodes.start:pose_graph_node",
+            "map_node = umf_ros.nodes.start:map_node",
             "bag_player_node = umf_ros.lab.live:bag_player_node",
         ],
     },

@@ -1,4 +1,4 @@
-"""Start the loop-closure front-end and the pose-graph back-end; optionally a bag player and RViz.
+"""Start loop-closure front-end, pose-graph back-end and the map of the ground; optionally a bag player and RViz.
 
 ros2 launch umf_ros loop_closure.launch.py params_file:=/path/to/params.yaml bag:=/path/to/recording.mcap
 
@@ -27,6 +27,7 @@ ARGUMENTS = [
     ("use_sim_time", "", "true: use /clock; empty: true if bag is set"),
     ("rviz", "false", "true: open RViz"),
     ("bag", "", "recording to play; empty: none"),
+    ("map", "true", "true: start map_node, the live map of the ground"),
     ("results_dir", "", "folder for closures, trajectories and the pose graph; empty: none"),
     ("autostart", "true", "true: the nodes configure and activate themselves; false: a life-cycle manager does"),
 ]
@@ -35,7 +36,7 @@ LONGEST_S = "60"
 """Time in s that launch gives the nodes to write their results at shutdown."""
 
 
-NODES = ("loop_closure_node", "pose_graph_node")
+NODES, MAP = ("loop_closure_node", "pose_graph_node"), "map_node"
 
 
 def start_nodes(context, *_):
@@ -49,9 +50,9 @@ def start_nodes(context, *_):
     config = value["params_file"] or value["config"]
     try:
         own = _own_parameters(value)
-        rviz = is_true("rviz", value["rviz"])
+        rviz, with_map = is_true("rviz", value["rviz"]), is_true("map", value["map"])
         if config:
-            check_parameter_file(Path(config), [full_name(value["namespace"], name) for name in NODES])
+            check_parameter_file(Path(config), [full_name(value["namespace"], name) for name in (*NODES, MAP)])
     except ConfigError as error:
         raise RuntimeError(str(error)) from None
     if value["bag"] and not Path(value["bag"]).exists():
@@ -73,11 +74,14 @@ def start_nodes(context, *_):
         )
 
     viewer = [_viewer(context, share, value["namespace"])] if rviz else []
-    nodes = [node(name, parameters=[*([config] if config else []), own]) for name in NODES]
+    parameters = [*([config] if config else []), own]
+    nodes = [node(name, parameters=parameters) for name in NODES]
     # neither node is useful alone: if one ends, launch ends the other
     ends = [
         RegisterEventHandler(OnProcessExit(target_action=one, on_exit=[EmitEvent(event=Shutdown())])) for one in nodes
     ]
+    if with_map:
+        nodes.append(node(MAP, parameters=parameters))
     if value["bag"]:
         player = node("bag_player_node", arguments=[value["bag"], "--wait-for-subscribers"])
         ends.append(RegisterEventHandler(OnProcessExit(target_action=player, on_exit=_end_if_it_failed)))

@@ -20,7 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 from umf_ros.core.config import Database, Settings
 from umf_ros.core.resources import find
 from umf_ros.detector import make_detector_embedder
-from umf_ros.nodes.conversions import to_time
+from umf_ros.nodes.conversions import SCAN_FIELDS, to_time
 from umf_ros.places.database import PlaceDatabase
 
 MODULE = "umf_ros.nodes.loop_closure_node"
@@ -51,6 +51,8 @@ class Rig(Node):
         self.messages: dict[str, str] = {}
         self.level = DiagnosticStatus.OK
         self.create_subscription(DiagnosticArray, "/diagnostics", self._listen, 10)
+        self.scans: list[PointCloud2] = []
+        self.create_subscription(PointCloud2, "/loop_closure_node/keyframe_scans", self.scans.append, 50)
         self._rng = np.random.default_rng(0)
 
     def _listen(self, message: DiagnosticArray) -> None:
@@ -133,6 +135,9 @@ def test_it_takes_frames_survives_bad_ones_and_ends_in_order(rig: Rig, node: Pro
         rig.publish_pair(START_NS + i * step)
         rig.until(lambda i=i: rig.count("cloud_received") > i)
     assert rig.until(lambda: rig.count("places") >= 6), node.output
+    assert rig.until(lambda: len(rig.scans) >= 6)
+    assert {tuple(field.name for field in scan.fields) for scan in rig.scans} == {tuple(SCAN_FIELDS)}
+    assert all(0 < scan.width <= 500 and len(scan.data) == 24 * scan.width for scan in rig.scans)
     assert node.exit_code is None
     assert node.interrupt() == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())

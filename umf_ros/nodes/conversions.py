@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from array import array
 from collections.abc import Iterable
 
 import numpy as np
@@ -12,6 +13,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, PoseWithCovarianceStampe
 from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -91,6 +93,20 @@ def to_markers(accepted: Iterable[Array], rejected: Iterable[Array], header: Hea
         marker.points = [to_point(end) for line in list(lines)[-MAX_LINES:] for end in line]
         array.markers.append(marker)
     return array
+
+
+SCAN_FIELDS = ["x", "y", "z", "vp_x", "vp_y", "vp_z"]
+"""Fields of a keyframe's scan: a point and where it was seen from, m, as in PCL's PointWithViewpoint."""
+
+
+def to_cloud(values: Array, names: list[str], header: Header) -> PointCloud2:
+    """Return (N, C) numbers as a cloud with a float32 field for each column."""
+    count, columns = values.shape
+    fields = [PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, name in enumerate(names)]
+    cloud = PointCloud2(header=header, height=1, width=count, fields=fields, point_step=4 * columns, is_dense=True)
+    cloud.row_step = count * cloud.point_step
+    cloud.data = array("B", np.ascontiguousarray(values, np.float32).tobytes())
+    return cloud
 
 
 def keyframe_frame(stamp_ns: int, robot: str = "") -> str:

@@ -17,6 +17,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
@@ -33,9 +34,11 @@ from umf_ros.nodes.conversions import (
     CLOSURES_QOS,
     LATCHED_QOS,
     MAX_LINES,
+    SCAN_FIELDS,
     closure_to_message,
     keyframe_frame,
     sensor_qos,
+    to_cloud,
     to_header,
     to_markers,
     to_pose,
@@ -54,6 +57,7 @@ if TYPE_CHECKING:
 
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
 INTAKE_QUEUE = 400
+SCAN_DEPTH = 50
 MESSAGE_TYPES = {"cloud": PointCloud2, "odometry": Odometry}
 MESSAGE_TYPES |= dict.fromkeys(("left_image", "right_image"), Image)
 MESSAGE_TYPES |= dict.fromkeys(("left_info", "right_info"), CameraInfo)
@@ -234,7 +238,7 @@ class LoopClosureNode(BaseNode):
 
 
 class ClosurePublisher:
-    """Publisher of loop closures, keyframes, tested candidates and markers.
+    """Publisher of loop closures, keyframes and their scans, tested candidates and markers.
 
     `loop_closures` carries verified closures only, `~/candidates` all tested candidates.
 
@@ -244,9 +248,10 @@ class ClosurePublisher:
 
     def __init__(self, node: Node, frames: FrameIds) -> None:
         self._node = node
-        self.odom = frames.odom
+        self.odom, self._base = frames.odom, frames.base
         self._closures = node.create_publisher(Odometry, "loop_closures", CLOSURES_QOS)
         self._keyframes = node.create_publisher(PoseStamped, "~/keyframes", CLOSURES_QOS)
+        self._scans = node.create_publisher(PointCloud2, "~/keyframe_scans", QoSProfile(depth=SCAN_DEPTH))
         self._candidates = node.create_publisher(DiagnosticArray, "~/candidates", 10)
         self._markers = node.create_publisher(MarkerArray, "~/markers", LATCHED_QOS)
         self._accepted: deque[Array] = deque(maxlen=MAX_LINES)
@@ -264,6 +269,10 @@ class ClosurePublisher:
         header = to_header(keyframe.stamp_ns, self.odom if known else keyframe_frame(keyframe.stamp_ns))
         pose = to_pose(np.eye(4) if keyframe.odom_T_body is None else keyframe.odom_T_body)
         self._keyframes.publish(PoseStamped(header=header, pose=pose))
+        if len(keyframe.points) and self._scans.get_subscription_count():
+            viewpoints = np.broadcast_to(keyframe.body_T_lidar[:3, 3], keyframe.points.shape)
+            header = to_header(keyframe.stamp_ns, self._base)
+            self._scans.publish(to_cloud(np.hstack([keyframe.points, viewpoints]), SCAN_FIELDS, header))
         if detection.verdicts:
             self._report(keyframe, detection.verdicts)
             self._draw(keyframe, detection.verdicts, matches)

@@ -45,6 +45,11 @@ def pose_graph_node() -> None:
     start("umf_ros.nodes.pose_graph_node")
 
 
+def map_node() -> None:
+    """Run `ros2 run umf_ros map_node`."""
+    start("umf_ros.nodes.map_node")
+
+
 PARAMETERS = "ros__parameters"
 
 

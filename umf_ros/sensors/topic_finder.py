@@ -14,7 +14,7 @@ FRONT_END = tuple(TYPES)
 BACK_END = ("odometry",)
 SETTLING_S = 3.0
 """Drivers and players announce their topics within this of each other, as a rule within a tenth of it."""
-_OWN = ("/loop_closures", "/pose_graph_node/", "/loop_closure_node/")
+_OWN = ("/loop_closures", "/pose_graph_node/", "/loop_closure_node/", "/map_node/")
 # names that image_pipeline gives to one camera's images, the best first: those of several are the same pictures
 _IMAGES = ("image_rect", "image_rect_color", "image_mono", "image", "image_color", "image_raw")
 _NO_PICTURES = ("depth", "mask", "semantic")

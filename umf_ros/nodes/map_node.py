@@ -1,0 +1,179 @@
+"""The live map of the ground: keyframes' scans and corrected path in, cloud and grid out, for those who listen."""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import OccupancyGrid, Odometry
+from nav_msgs.msg import Path as PathMessage
+from rclpy.qos import QoSProfile
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import PointCloud2
+
+from umf_ros.core import watchdog
+from umf_ros.core.config import Settings, topics_of
+from umf_ros.core.errors import MessageError, UmfError
+from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.nodes.base_node import BaseNode
+from umf_ros.nodes.conversions import LATCHED_QOS, SCAN_FIELDS, from_time, sensor_qos, to_cloud, to_header
+from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
+from umf_ros.nodes.process import Worker, leave, run
+from umf_ros.sensors.decode import decode_odometry, stamp_ns
+from umf_ros.sensors.topic_finder import BACK_END
+from umf_ros.terrain.export import write_terrain
+from umf_ros.terrain.grid import TerrainGrid, make_grid
+from umf_ros.terrain.living_map import LivingMap
+
+ODOMETRY_DEPTH, SCAN_DEPTH, QUEUE = 200, 50, 10_000
+RESTING = 4.0
+"""Least pause between two updates, as a multiple of their duration: a large map takes one core a fifth of the time."""
+
+
+class MapNode(BaseNode):
+    """Map node: static points and the grid of where the rover can drive, in a thread and a process of its own."""
+
+    def __init__(self) -> None:
+        super().__init__("map_node", "folder for map.yaml, map.pgm and elevation.tif; empty: none", BACK_END)
+
+    def _open(self) -> None:
+        settings, topics = self._settings, topics_of(self._settings)
+        self._map = LivingMap(settings.terrain)
+        self._path: PathMessage | None = None
+        self._version, self._sent = 0, {"cloud": 0, "grid": 0}
+        self._due_s, self._bytes, self._queued = 0.0, 0, False
+        self._publishers_of: dict[str, Any] = {
+            "cloud": self.create_publisher(PointCloud2, "~/map_cloud", LATCHED_QOS),
+            "grid": self.create_publisher(OccupancyGrid, "~/map_grid", LATCHED_QOS),
+        }
+        self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._report_fault, QUEUE)
+        self._body_frames = self._subscribe_transforms()
+        qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
+        self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
+        scans = "loop_closure_node/keyframe_scans"
+        self._subscribe("scans", PointCloud2, scans, self._on_scan, QoSProfile(depth=SCAN_DEPTH), rare=True)
+        self._subscribe("path", PathMessage, "pose_graph_node/path", self._on_path, LATCHED_QOS, rare=True)
+        self._offer_in_turn(self._worker, "~/save", lambda _: self._save())
+
+    def _finish(self) -> None:
+        self._worker.close(timeout_s=watchdog.PATIENT_S)
+        if self._results and len(self._map.voxels):
+            self._save()
+
+    def _retune(self, settings: Settings) -> None:
+        """Nothing of the map changes while the node runs."""
+
+    def _on_odometry(self, message: Odometry) -> None:
+        sample = decode_odometry(message)
+        pose = self._body_frames.to_body(message, sample.odom_T_body)
+        self._worker.submit(lambda: self._map.add_odometry(sample.stamp_ns, pose))
+
+    def _on_scan(self, message: PointCloud2) -> None:
+        self._worker.submit(lambda: self._take_scan(message))
+
+    def _take_scan(self, message: PointCloud2) -> None:
+        if [one.name for one in message.fields] != SCAN_FIELDS or len(message.data) % (4 * len(SCAN_FIELDS)):
+            raise MessageError("scan", f"keyframe scan without the fields {' '.join(SCAN_FIELDS)}")
+        values = np.frombuffer(message.data, np.float32).reshape(-1, len(SCAN_FIELDS))
+        values = values[np.isfinite(values).all(axis=1)]
+        if len(values):
+            self._map.add_scan(stamp_ns(message), values[:, :3], values[0, 3:].astype(float))
+
+    def _on_path(self, message: PathMessage) -> None:
+        self._path = message  # the newest one is decoded when there is an update
+
+    def _tick(self) -> None:
+        listening = any(publisher.get_subscription_count() for publisher in self._publishers_of.values())
+        if listening and not self._queued and time.monotonic() >= self._due_s:
+            self._queued = True
+            self._worker.submit(self._show)
+        self._diagnose(self._judge(self._own_status()))
+
+    def _update(self) -> None:
+        path, self._path = self._path, None
+        if path is not None:
+            self._map.correct(_trajectory(path))
+        self._version += self._map.update()
+
+    def _show(self) -> None:
+        """Publish what has changed and has subscribers, then pause as the limits of rate and bytes say."""
+        began_s, sent = time.thread_time(), 0
+        self._queued = False
+        self._update()
+        readers = {name: one.get_subscription_count() for name, one in self._publishers_of.items()}
+        wanted = [name for name, count in readers.items() if count and self._sent[name] != self._version]
+        points = self._map.voxels.points() if wanted else np.empty((0, 3), np.float32)
+        header = to_header(self._map.newest_ns, self._settings.frames.map)
+        for name in wanted:
+            if name == "cloud":
+                message: Any = to_cloud(points, ["x", "y", "z"], header)
+            else:
+                message = to_grid(make_grid(points.astype(float), self._settings.terrain), header)
+            self._publishers_of[name].publish(message)
+            self._sent[name] = self._version
+            sent += len(message.data) * readers[name]
+        terrain = self._settings.terrain
+        pause_s = max(terrain.period_s, sent / terrain.max_bytes_per_s, RESTING * (time.thread_time() - began_s))
+        self._due_s, self._bytes = time.monotonic() + pause_s, self._bytes + sent
+
+    def _save(self) -> str:
+        self._update()
+        folder = Path(self._results or "map_results")
+        folder.mkdir(parents=True, exist_ok=True)
+        points = self._map.voxels.points().astype(float)
+        if not len(points):
+            raise UmfError("nothing to write: no scan has a place in the map yet")
+        missing = write_terrain(folder, points, self._settings.terrain)
+        return f"map.yaml and map.pgm written to {folder}" + (f"; {missing}" if missing else ", and elevation.tif")
+
+    def _own_status(self) -> DiagnosticStatus:
+        values = {
+            **self._faults,
+            "keyframes": self._map.voxels.scans,
+            "keyframes_waiting": self._map.waiting,
+            "voxels": len(self._map.voxels),
+            "rebuilt": self._map.rebuilt,
+            "bytes_published": self._bytes,
+            "queue_dropped": self._worker.dropped,
+            "executor_stall_max_ms": self._stall_ms,
+        }
+        level = ERROR if self._cannot_write else WARN if self._worker.dropped or self._faults else OK
+        return status(level, "map", f"{self._map.voxels.scans} keyframes in the map", values)
+
+
+def to_grid(grid: TerrainGrid, header: Any) -> OccupancyGrid:
+    """Return the grid as a message."""
+    message = OccupancyGrid(header=header)
+    message.info.map_load_time, message.info.resolution = header.stamp, grid.cell_m
+    message.info.height, message.info.width = grid.cells.shape
+    message.info.origin.position.x, message.info.origin.position.y = grid.lower.tolist()
+    message.info.origin.orientation.w = 1.0
+    message.data = array("b", grid.cells.tobytes())
+    return message
+
+
+def _trajectory(message: PathMessage) -> Trajectory:
+    """Return the poses of a path, in the order of their stamps."""
+    stamps = np.array([from_time(one.header.stamp) for one in message.poses], np.int64)
+    places = [(one.pose.position, one.pose.orientation) for one in message.poses]
+    poses: Array = np.tile(np.eye(4), (len(stamps), 1, 1))
+    if len(stamps):
+        poses[:, :3, 3] = [(at.x, at.y, at.z) for at, _ in places]
+        poses[:, :3, :3] = Rotation.from_quat([(q.x, q.y, q.z, q.w) for _, q in places]).as_matrix()
+    stamps, first = np.unique(stamps, return_index=True)
+    return Trajectory(stamps, poses[first])
+
+
+def main() -> None:
+    """Run `ros2 run umf_ros map_node`."""
+    leave(run(MapNode))
+
+
+if __name__ == "__main__":
+    main()
