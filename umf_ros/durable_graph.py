@@ -176,11 +176,18 @@ class DurableGraph:
         found = self.graph.closures()
         return next((one.closure for one in reversed(found) if one.state is State.ACCEPTED), None)
 
-    def drawing(self) -> tuple[Stamps, Array, Array, Array]:
-        """Return stamps and poses of the path, and (N, 2, 3) ends of accepted and of other closures in the map."""
-        verdicts, lines = self.graph.closure_lines()
-        accepted = np.array([verdict.state is State.ACCEPTED for verdict in verdicts], bool)
-        return *self.graph.trajectory(), lines[accepted], lines[~accepted]
+    def drawing(self) -> tuple[Stamps, Array, dict[State, Array], dict[State, Array]]:
+        """Return what is drawn in the map.
+
+        Returns:
+            Stamps (N,) and poses (N, 4, 4) of the path; by state, ends (K, 2, 3) of closures and places (K, 3) of
+            absolute measurements.
+        """
+        found = self.graph.closure_lines(), self.graph.absolute_places()
+        closures, absolute = (
+            {state: places[[one.state is state for one in verdicts]] for state in State} for verdicts, places in found
+        )
+        return *self.graph.trajectory(), closures, absolute
 
     def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
         """Settle the graph and write its results; mark a graph that is not settled in time in the log.

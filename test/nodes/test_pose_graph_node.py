@@ -169,7 +169,8 @@ def test_a_drive_ends_on_its_true_path_and_wrong_closures_stay_out(rig: Rig, pro
     assert rig.heard["map_to_odom"][-1].child_frame_id == "odom"
     rig.until(lambda: len(rig.heard["path"][-1].poses) >= len(rig.world.truth) - 5)
     rig.until(lambda: sum(len(m.points) for m in rig.heard["markers"][-1].markers) == 2 * len(rig.world.closures))
-    green, red = rig.heard["markers"][-1].markers
+    green, _, red, *measured = rig.heard["markers"][-1].markers
+    assert [marker.ns for marker in measured] == ["absolute accepted", "absolute pending", "absolute rejected"]
     assert (green.ns, red.ns) == ("accepted", "rejected")
 
     assert process.interrupt() == 0

@@ -13,6 +13,7 @@ from sources import ROOT
 
 from umf_ros.core.config import FrameIds, Topics
 from umf_ros.nodes.loop_closure_node import ClosurePublisher
+from umf_ros.nodes.map_node import MapNode
 from umf_ros.nodes.pose_graph_node import PoseGraphNode
 
 LATCHED = QoSDurabilityPolicy.TRANSIENT_LOCAL
@@ -21,26 +22,29 @@ SHOWN_AS = {
     "rviz_default_plugins/MarkerArray": "MarkerArray",
     "rviz_default_plugins/PoseWithCovariance": "PoseWithCovarianceStamped",
     "rviz_default_plugins/Image": "Image",
+    "rviz_default_plugins/Map": "OccupancyGrid",
+    "rviz_default_plugins/PointCloud2": "PointCloud2",
 }
 
 
 @pytest.fixture
 def published(ros_context: None) -> Iterator[dict[str, tuple[str, bool]]]:
     """Every topic, with its type and whether it is latched."""
-    back, front = PoseGraphNode(), Node("loop_closure_node")
+    back, ground, front = PoseGraphNode(), MapNode(), Node("loop_closure_node")
     ClosurePublisher(front, FrameIds())
-    made = [*back.publishers, *front.publishers]
+    made = [*back.publishers, *ground.publishers, *front.publishers]
     topics = {item.topic_name: (item.msg_type.__name__, item.qos_profile.durability == LATCHED) for item in made}
     yield topics | {Topics().left_image: ("Image", False)}
-    back.close()
-    for node in (back, front):
+    for node in (back, ground):
+        node.close()
+    for node in (back, ground, front):
         node.destroy_node()
 
 
 def test_rviz_shows_what_is_there(published: dict[str, tuple[str, bool]]) -> None:
     manager = yaml.safe_load((ROOT / "config" / "loop_closure.rviz").read_text())["Visualization Manager"]
     shown = [display for display in manager["Displays"] if "Topic" in display]
-    assert len(shown) >= 5
+    assert len(shown) >= 7
     for display in shown:
         topic = display["Topic"]
         assert topic["Value"][0] != "/", "relative: RViz runs in the namespace of the nodes"

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from umf_ros.absolute.measurement import AbsoluteReason, AbsoluteVerdict, Aid, write_verdicts
 from umf_ros.core.config import Verification
 from umf_ros.core.errors import ConfigError, OutputError
-from umf_ros.core.frames import Candidate, Frame, Keyframe
+from umf_ros.core.frames import Candidate, Frame, Keyframe, State
 from umf_ros.detector import Detection
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 from umf_ros.runs.rerun_log import RerunLog
@@ -57,6 +58,17 @@ def test_what_was_seen_and_found_is_in_the_file(tmp_path: Path) -> None:
     assert {"/camera/left", "/rover", "/rover/scan", "/trajectory/odometry"} <= found
     assert sum(name.startswith("/closures/") for name in found) == 1
     assert "/trajectory/optimized" not in found  # the run has none
+
+
+def test_the_map_and_verdicts_by_state_are_in_the_file(tmp_path: Path) -> None:
+    (tmp_path / "trajectory_optimized.tum").write_text("10.0 -15 0 0 0 0 0 1\n11.0 -14 0 0 0 0 0 1\n")
+    write_verdicts(
+        tmp_path / "absolute_verdicts.csv",
+        [AbsoluteVerdict(Aid.GNSS, 10 * 10**9, State.REJECTED, AbsoluteReason.CONTRADICTS, 9.0, 20.0)],
+    )
+    run(tmp_path / "run.rrd", tmp_path)
+    found = logged(tmp_path / "run.rrd")
+    assert {"/map/cloud", "/map/grid", "/map/closures/accepted", "/map/absolute/rejected"} <= found
 
 
 def test_without_the_package_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

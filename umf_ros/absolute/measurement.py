@@ -124,6 +124,14 @@ def write_verdicts(path: Path, verdicts: Iterable[AbsoluteVerdict]) -> None:
     write_table(path, VERDICT_COLUMNS, rows)
 
 
+def read_verdict_states(path: Path) -> list[tuple[int, State]]:
+    """Return stamp and state of the measurements in the table of a run; empty without a table."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return [(int(row["stamp_ns"]), State(row["verdict"])) for row in csv.DictReader(file)]
+
+
 def read_verdict_counts(path: Path) -> Counter[tuple[str, str, str]]:
     """Return the number of measurements by source, verdict and reason in the table of a run; empty without a table."""
     if not path.is_file():

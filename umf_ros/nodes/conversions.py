@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -19,7 +19,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from umf_ros.core.config import FrameIds, Qos
 from umf_ros.core.errors import MessageError
-from umf_ros.core.frames import LoopClosure
+from umf_ros.core.frames import LoopClosure, State
 from umf_ros.core.geometry import Array, evenly, from_quaternion, to_quaternion
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose
 
@@ -44,7 +44,9 @@ def sensor_qos(settings: Qos, min_depth: int = 1) -> QoSProfile:
 
 
 GREEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
+AMBER = ColorRGBA(r=0.95, g=0.7, b=0.1, a=0.8)
 RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.5)
+COLOURS = {State.ACCEPTED: GREEN, State.PENDING: AMBER, State.REJECTED: RED}
 BETWEEN_FRAME = re.compile(r"keyframe/[^/]{1,63}/[0-9]{1,19}")
 KEYFRAME_FRAME = re.compile(r"keyframe/([0-9]{1,19})")
 
@@ -83,14 +85,25 @@ def to_header(stamp_ns: int, frame: str) -> Header:
     return Header(stamp=to_time(stamp_ns), frame_id=frame)
 
 
-def to_markers(accepted: Iterable[Array], rejected: Iterable[Array], header: Header) -> MarkerArray:
-    """Return closures as lines (2, 3) m from match to query, the newest last: accepted green, the others red."""
+def to_markers(
+    closures: Mapping[State, Iterable[Array]], header: Header, absolute: Mapping[State, Array] | None = None
+) -> MarkerArray:
+    """Return closures by state as lines (2, 3) m from match to query, and absolute measurements as points (N, 3) m.
+
+    The newest are last; there are at most `MAX_LINES` of a state.
+    """
     array = MarkerArray()
-    for number, (name, colour, lines) in enumerate((("accepted", GREEN, accepted), ("rejected", RED, rejected))):
-        marker = Marker(header=header, ns=name, id=number, type=Marker.LINE_LIST, action=Marker.ADD, color=colour)
+    lines = {
+        state.value: (state, [end for line in list(ends)[-MAX_LINES:] for end in line])
+        for state, ends in closures.items()
+    }
+    points = {f"absolute {state.value}": (state, at[-MAX_LINES:]) for state, at in (absolute or {}).items()}
+    for number, (name, (state, places)) in enumerate((lines | points).items()):
+        marker = Marker(header=header, ns=name, id=number, action=Marker.ADD, color=COLOURS[state])
+        marker.type, marker.scale.x = (Marker.LINE_LIST, 0.05) if name in lines else (Marker.POINTS, 0.2)
+        marker.scale.y = 0.0 if name in lines else 0.2
         marker.pose.orientation.w = 1.0
-        marker.scale.x = 0.05
-        marker.points = [to_point(end) for line in list(lines)[-MAX_LINES:] for end in line]
+        marker.points = [to_point(place) for place in places]
         array.markers.append(marker)
     return array
 

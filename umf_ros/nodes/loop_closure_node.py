@@ -26,7 +26,7 @@ from visualization_msgs.msg import MarkerArray
 from umf_ros.core import watchdog
 from umf_ros.core.config import FrameIds, Settings, topics_of
 from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line
-from umf_ros.core.frames import Frame, Keyframe, LoopClosure
+from umf_ros.core.frames import Frame, Keyframe, LoopClosure, State
 from umf_ros.core.geometry import Array, rotation_angle
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.nodes.base_node import BaseNode
@@ -307,7 +307,7 @@ class ClosurePublisher:
             lines = self._rejected if verdict.closure is None else self._accepted
             lines.append(np.stack([match.odom_T_body[:3, 3], keyframe.odom_T_body[:3, 3]]))
         header = to_header(keyframe.stamp_ns, self.odom)
-        self._markers.publish(to_markers(self._accepted, self._rejected, header))
+        self._markers.publish(to_markers({State.ACCEPTED: self._accepted, State.REJECTED: self._rejected}, header))
 
 
 def describe(number: int, closure: LoopClosure) -> str:

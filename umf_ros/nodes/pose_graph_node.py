@@ -242,10 +242,10 @@ class PoseGraphNode(BaseNode):
             self._next_draw_s = time.monotonic() + DRAWING * (time.thread_time() - started_s)
 
     def _draw(self) -> None:
-        stamps, poses, accepted, others = self._durable.drawing()
+        stamps, poses, closures, absolute = self._durable.drawing()
         self._path_publisher.publish(messages.path(stamps, poses, self._frames))
         header = messages.to_header(max(self._state.newest_ns, 0), self._frames.map)
-        self._marker_publisher.publish(messages.to_markers(accepted, others, header))
+        self._marker_publisher.publish(messages.to_markers(closures, header, absolute))
 
     def _tick(self) -> None:
         if not self._update_queued:  # queued at most once, however long the worker is busy

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.absolute.measurement import AbsoluteMeasurement, write_verdicts
+from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteVerdict, write_verdicts
 from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError, writing
@@ -365,6 +365,12 @@ class PoseGraph:
         self._refresh()
         positions = [self._sessions.at(self._rejection.closures[end])[:, :3, 3] for end in ("match", "query")]
         return list(self._rejection.verdicts), np.stack(positions, axis=1)
+
+    def absolute_places(self) -> tuple[list[AbsoluteVerdict], Array]:
+        """Return verdicts of the N absolute measurements with a place in the map, and (N, 3) that of the rover then."""
+        found = self.reference.verdicts()
+        poses, known = self.poses_at(np.array([one.stamp_ns for one in found], np.int64))
+        return [found[row] for row in np.flatnonzero(known)], poses[known, :3, 3]
 
     def graph(self) -> Graph:
         """Return keyframes by session and stamp, odometry and accepted closures, with the solution's covariances."""

@@ -6,16 +6,26 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
+
+from umf_ros.absolute.measurement import read_verdict_states
 from umf_ros.bags.trajectories import read_tum
+from umf_ros.core.config import TerrainSettings
 from umf_ros.core.errors import ConfigError, writing
-from umf_ros.core.frames import Frame, Keyframe
+from umf_ros.core.frames import Frame, Keyframe, LoopClosure, Points, State
 from umf_ros.core.geometry import Array
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.runs.run_file import read_closures, read_verdicts
+from umf_ros.terrain.grid import FREE, NEAR_LIMIT, OBSTACLE, UNKNOWN, make_grid
+from umf_ros.terrain.voxels import VoxelMap
 
 if TYPE_CHECKING:
     from umf_ros.detector import Detection
 
 Item = TypeVar("Item")
-GREY, BLUE, GREEN = (150, 150, 150), (60, 120, 216), (40, 160, 60)
+GREY, BLUE, GREEN, AMBER, RED = (150, 150, 150), (60, 120, 216), (40, 160, 60), (240, 180, 30), (220, 40, 40)
+STATE_COLOURS = {State.ACCEPTED: GREEN, State.PENDING: AMBER, State.REJECTED: RED}
+GRID_COLOURS = {FREE: GREEN, NEAR_LIMIT: AMBER, OBSTACLE: RED}
 MOST_POINTS = 5000
 """Most points of a logged scan; a viewer shows thousands of scans together."""
 
@@ -46,6 +56,7 @@ class RerunLog:
         self._log.save(path)
         self._frame: Frame | None = None
         self._places: dict[int, Array] = {}
+        self._scans: dict[int, tuple[Points, Array]] = {}
 
     def watch(self, stream: Iterable[Item]) -> Iterator[Item]:
         """Yield the same stream; its latest frame is kept until its detection is logged."""
@@ -68,21 +79,53 @@ class RerunLog:
         self._show_in_space(keyframe, detection)
 
     def finish(self, folder: Path) -> None:
-        """Log both trajectories of a run folder, if there are any, and finish the file."""
+        """Log trajectories, map and verdicts of a run folder, if there are any, and finish the file."""
         paths = (("odometry", GREY), ("optimized", BLUE))
         for name, colour in paths:
             path = folder / f"trajectory_{name}.tum"
             if path.is_file() and path.stat().st_size:
-                line = self._rerun.LineStrips3D([read_tum(path).poses[:, :3, 3]], colors=[colour])
+                driven = read_tum(path)
+                line = self._rerun.LineStrips3D([driven.poses[:, :3, 3]], colors=[colour])
                 self._log.log(f"trajectory/{name}", line, static=True)
+                if name == "optimized":
+                    self._show_map(folder, driven)
         self._log.flush()
         self._log.disconnect()
+
+    def _show_map(self, folder: Path, driven: Trajectory) -> None:
+        """Log the ground, and closures and absolute measurements by state, at the poses of the trajectory."""
+        settings, rerun = TerrainSettings(), self._rerun
+        voxels = VoxelMap(settings.cell_m)
+        poses, known = driven.at(np.array(list(self._scans), np.int64))
+        scans = [(*scan, pose) for scan, pose in zip(self._scans.values(), poses, strict=True)]
+        voxels.add([scan for scan, is_known in zip(scans, known, strict=True) if is_known])
+        points = voxels.points()
+        if len(points):
+            grid = make_grid(points.astype(float), settings)
+            rows, columns = np.nonzero(grid.cells != UNKNOWN)
+            centres = grid.lower + (np.column_stack([columns, rows]) + 0.5) * grid.cell_m
+            cells = np.column_stack([centres, grid.heights[rows, columns]])
+            colours = [GRID_COLOURS[value] for value in grid.cells[rows, columns].tolist()]
+            self._log.log("map/cloud", rerun.Points3D(points, radii=0.05, colors=[GREY]), static=True)
+            self._log.log("map/grid", rerun.Points3D(cells, radii=grid.cell_m / 2, colors=colours), static=True)
+        verdicts = read_verdicts(folder / "graph_verdicts.csv", _closures(folder))
+        ends = {key: one.state for key, one in verdicts.items()}
+        measured = read_verdict_states(folder / "absolute_verdicts.csv")
+        for state, colour in STATE_COLOURS.items():
+            stamps = np.array([key for key, own in ends.items() if own is state], np.int64).reshape(-1, 2)
+            places, known = driven.at(stamps.ravel())
+            lines = places[:, :3, 3].reshape(-1, 2, 3)[known.reshape(-1, 2).all(axis=1)]
+            self._log.log(f"map/closures/{state.value}", rerun.LineStrips3D(lines, colors=[colour]), static=True)
+            places, known = driven.at(np.array([stamp for stamp, own in measured if own is state], np.int64))
+            shown = rerun.Points3D(places[known, :3, 3], radii=0.1, colors=[colour])
+            self._log.log(f"map/absolute/{state.value}", shown, static=True)
 
     def _show_in_space(self, keyframe: Keyframe, detection: Detection) -> None:
         pose = keyframe.odom_T_body
         if pose is None:
             return
         self._places[keyframe.stamp_ns] = pose[:3, 3]
+        self._scans[keyframe.stamp_ns] = keyframe.points, keyframe.body_T_lidar
         rerun = self._rerun
         self._log.log("rover", rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         step = max(len(keyframe.points) // MOST_POINTS, 1)
@@ -94,3 +137,9 @@ class RerunLog:
         ]
         if ends:
             self._log.log(f"closures/{keyframe.stamp_ns}", rerun.LineStrips3D(ends, colors=[GREEN]))
+
+
+def _closures(folder: Path) -> list[LoopClosure]:
+    """Return the closures of a run folder."""
+    path = folder / "closures.csv"
+    return read_closures(path) if path.is_file() else []
