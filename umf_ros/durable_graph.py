@@ -185,7 +185,8 @@ class DurableGraph:
         """
         found = self.graph.closure_lines(), self.graph.absolute_places()
         closures, absolute = (
-            {state: places[[one.state is state for one in verdicts]] for state in State} for verdicts, places in found
+            {state: places[[one.state is state for one in verdicts]] for state in State if state is not State.REFUSED}
+            for verdicts, places in found
         )
         return *self.graph.trajectory(), closures, absolute
 
