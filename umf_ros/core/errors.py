@@ -17,8 +17,6 @@ def shortened(text: object) -> str:
 
 def one_line(error: BaseException) -> str:
     """Return the text of an exception on one line; its type where it has none."""
-    if isinstance(error, KeyError):
-        return f"no {shortened(error)}"
     return shortened(error) or type(error).__name__
 
 
