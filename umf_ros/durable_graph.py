@@ -184,9 +184,9 @@ class DurableGraph:
             absolute measurements.
         """
         found = self.graph.closure_lines(), self.graph.absolute_places()
+        drawn: tuple[State, ...] = (State.ACCEPTED, State.PENDING, State.REJECTED)
         closures, absolute = (
-            {state: places[[one.state is state for one in verdicts]] for state in State if state is not State.REFUSED}
-            for verdicts, places in found
+            {state: places[[one.state is state for one in verdicts]] for state in drawn} for verdicts, places in found
         )
         return *self.graph.trajectory(), closures, absolute
 

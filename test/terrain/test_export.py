@@ -14,8 +14,7 @@ from umf_ros.absolute.elevation import load_elevation
 from umf_ros.core.config import TerrainSettings
 from umf_ros.core.geometry import Array, from_enu, make_pose, to_enu
 from umf_ros.core.trajectory import write_geojson
-from umf_ros.terrain.export import write_grid, write_terrain
-from umf_ros.terrain.grid import FREE, OBSTACLE, UNKNOWN, make_grid
+from umf_ros.terrain.grid import FREE, OBSTACLE, UNKNOWN, make_grid, write_grid, write_terrain
 
 SETTINGS = TerrainSettings()
 ORIGIN = np.array([37.75, 14.99, 1800.0])

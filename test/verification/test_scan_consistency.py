@@ -9,10 +9,9 @@ import pytest
 
 from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.verification import thin_scan
-from umf_ros.verification.ambiguity import ambiguity
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import inspect
-from umf_ros.verification.scan_consistency import compare_scans
+from umf_ros.verification.scan_consistency import ambiguity, compare_scans
 
 RNG = np.random.default_rng(5)
 UP = make_pose(np.eye(3), [0.0, 0.0, 1.5])  # the sensor on its mast

@@ -22,7 +22,7 @@ from umf_ros.maps.map_folder import MapFolder
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import stored_identity
 from umf_ros.runs.gallery import HeightMap
-from umf_ros.terrain.export import write_terrain
+from umf_ros.terrain.grid import write_terrain
 from umf_ros.terrain.voxels import REACH_M, PlacedScan, VoxelMap
 
 VOXEL_M = 0.1

@@ -1,8 +1,8 @@
 """Voxels of aligned scans, without what later rays pass through: people, vehicles, rocks that were moved.
 
 Every voxel has the first and the last scan that hit it, and the number of scans after the last one whose rays pass
-through it. Two such scans make a voxel free. Voxels that touch a free one from above or below, and were hit within the
-same time, are free too: of a person in front of the sky, only the legs have rays behind them.
+through it. Three such scans make a voxel free. Voxels that touch a free one from above or below, and were hit within
+the same time, are free too: of a person in front of the sky, only the legs have rays behind them.
 """
 
 from __future__ import annotations

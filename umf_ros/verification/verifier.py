@@ -14,7 +14,6 @@ from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading, near
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
-from umf_ros.verification.ambiguity import ambiguity
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
 from umf_ros.verification.passages import locate_along
@@ -22,6 +21,7 @@ from umf_ros.verification.pose_search import TemporalMemory, consistent_pixels, 
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans, inspect
+from umf_ros.verification.scan_consistency import ambiguity
 from umf_ros.verification.yaw_search import RotatedMaps
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})

@@ -45,12 +45,12 @@ from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, Measurements, load_acceptance, refuted
-from umf_ros.verification.ambiguity import ambiguity
 from umf_ros.verification.hypothesis import SCAN, Hypothesis
 from umf_ros.verification.measurement import measure, runner_up
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.rerank import rerank
 from umf_ros.verification.scan_alignment import align_scans
+from umf_ros.verification.scan_consistency import ambiguity
 
 RIGHT_M, RIGHT_DEG = 0.3, 2.5
 WRONG_M, WRONG_DEG = 0.75, 4.0  # what lies between is neither
