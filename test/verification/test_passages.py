@@ -23,7 +23,7 @@ ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
 AZIMUTHS = np.radians(np.arange(0.0, 360.0, 0.4))
 HALF_WIDTH_M, HEIGHT_M, LIDAR_M = 1.1, 2.6, 0.8
 CUPBOARDS = (-11.3, -6.1, -3.2, 2.4, 5.3, 9.8)  # on alternating sides, m along
-UNEVEN = tuple(np.sort(np.random.default_rng(1).uniform(-15, 16, 20)))
+UNEVEN = tuple(np.sort(np.random.default_rng(0).uniform(-15, 16, 20)))
 
 
 def rays() -> Array:
@@ -104,6 +104,13 @@ def test_identical_door_frames_at_equal_distances_are_rivals_of_each_other() -> 
     match, query = corridor(0.0, 1, doors, 0.06), corridor(6.0, 2, doors, 0.06)
     for metres in (0.0, 6.0):
         assert lead(match, query, shift(metres)) < 1.0
+
+
+def test_a_scan_leads_all_others_with_itself() -> None:
+    """Also where every alignment ends at the same pose."""
+    found = locate_along(corridor(0.0, 1, UNEVEN, 0.3), corridor(0.0, 1, UNEVEN, 0.3), np.eye(4))
+    assert found is not None and found.lead > 0.5
+    assert np.linalg.norm(found.pose[:3, 3]) < 0.05
 
 
 def test_a_single_thing_that_stood_elsewhere_is_no_evidence_of_a_position() -> None:

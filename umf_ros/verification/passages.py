@@ -122,12 +122,12 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
         return None
     shifted = np.repeat(pose[None], len(const.PASSAGE_SHIFTS_M), axis=0)
     shifted[:, :3, 3] += const.PASSAGE_SHIFTS_M[:, None] * way
-    picks = _peaks(PassageFit(match, query, const.SCOUT_EVERY).at(shifted).means)
-    aligned = [run_gicp(match, query.sample_cloud, shifted[pick], const.FINE_REACH_M) for pick in picks]
-    poses = np.stack([pose, *aligned])
+    best = shifted[_peaks(PassageFit(match, query, const.SCOUT_EVERY).at(shifted).means)]
+    aligned = [run_gicp(match, query.sample_cloud, one, const.FINE_REACH_M) for one in best]
+    poses = np.stack([pose, *aligned, *best])  # alignments may all end at one pose
     comparison = PassageFit(match, query)
     fit = comparison.at(poses)
-    first = int(np.argmin(fit.means))
+    first = int(np.argmin(fit.means[: 1 + len(aligned)]))
     return PassagePosition(poses[first], _lead(fit, comparison, poses, first, way))
 
 
