@@ -66,6 +66,13 @@ def closure(pose):
     return LoopClosure(2, 1, pose, np.diag([0.01] * 3 + [1e-4] * 3))
 
 
+def test_a_closure_between_two_worlds_is_wrong_wherever_it_lies():
+    pair = ScanPair(place(10.5, "offset"), place(9.0, "first", world=2), ELSEWHERE)
+    outcome = Outcome("one")
+    outcome.judge(pair, closure(pair.match_T_query))
+    assert outcome.figures["wrong"] == 1
+
+
 def test_verdicts_are_counted_by_their_truth():
     same = ScanPair(place(10.5, "offset"), place(9.0, "first"), SAME)
     far = ScanPair(place(10.5, "offset"), place(40.0, "first"), ELSEWHERE)

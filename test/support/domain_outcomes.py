@@ -42,7 +42,8 @@ class Outcome:
         if closure is None:
             return
         self.by_submaps += by_submaps
-        if is_wrong(closure.match_T_query, pair.match_T_query):  # distant places may well share a view
+        elsewhere = pair.query.world != pair.match.world  # within one world, distant places may well share a view
+        if elsewhere or is_wrong(closure.match_T_query, pair.match_T_query):
             self.wrong[pair.kind] += 1
             return
         self.right[pair.kind] += 1
