@@ -20,7 +20,7 @@ from umf_ros.verification.acceptance import (
     refuted,
     scores,
 )
-from umf_ros.verification.constants import MAX_MISFIT, MIN_RUNNER_UP, MIN_TERRAIN
+from umf_ros.verification.constants import MAX_MISFIT, MIN_RUNNER_UP, MIN_TERRAIN, SUBMAP_UNEXPLAINED
 from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, kind_of
 from umf_ros.verification.measurement import MEASUREMENTS
 
@@ -211,6 +211,9 @@ def test_what_was_never_measured_is_not_what_a_closure_was_lost_by(shipped: Acce
         (GOOD | {"runner_up": 0.99 * MIN_RUNNER_UP}, RejectReason.AMBIGUOUS),
         (GOOD | {"passage_lead": 1.01}, None),
         (GOOD | {"passage_lead": 0.99}, RejectReason.PASSAGE),
+        (GOOD | {"merged": 12.0, "unexplained": 0.99 * SUBMAP_UNEXPLAINED}, None),
+        (GOOD | {"merged": 12.0, "unexplained": 1.01 * SUBMAP_UNEXPLAINED}, RejectReason.UNEXPLAINED),
+        (GOOD | {"merged": 1.0, "unexplained": 1.01 * SUBMAP_UNEXPLAINED}, None),
         (GOOD | NARROW | {"terrain_correlation": 0.99 * MIN_TERRAIN}, RejectReason.TERRAIN),
         (GOOD | {"terrain_correlation": 0.99 * MIN_TERRAIN}, None),
         (without(GOOD, *RIVALS), None),

@@ -127,6 +127,9 @@ def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
         return RejectReason.MISFIT, f"{misfit:.0f} times"
     if measurements.get("passage_lead", math.nan) < 1.0:
         return RejectReason.PASSAGE, ""
+    unexplained = measurements.get("unexplained", math.nan)
+    if kind == SCAN and measurements.get("merged", 1.0) > 1 and unexplained > const.SUBMAP_UNEXPLAINED:
+        return RejectReason.UNEXPLAINED, f"{unexplained:.0%}"
     correlation = measurements["terrain_correlation"]
     if kind == SUBMAP and not correlation >= const.MIN_TERRAIN:
         return RejectReason.TERRAIN, f"correlation {correlation:.2f}"

@@ -32,6 +32,7 @@ class RejectReason(Enum):
     MISFIT = "surfaces are several times their noise apart"
     PASSAGE = "surfaces fit as well elsewhere along the passage"
     AMBIGUOUS = "another pose fits as well"
+    UNEXPLAINED = "too much of what stands in one submap is missing in the other"
     TERRAIN = "the terrain of the submaps does not fit"
     OUT_OF_RANGE = "a measurement outside the range of the fitted examples"
     TURNED = "turned by more than verification.max_turn_deg"

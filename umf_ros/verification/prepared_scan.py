@@ -111,10 +111,15 @@ class PreparedScan:
             return cls(keyframe.points, keyframe.body_T_lidar, blur_m)
         return cls(keyframe.points, motion.body_T_lidars, blur_m, np.unique(motion.moments_s, return_inverse=True)[1])
 
+    @property
+    def merged(self) -> int:
+        """Number of merged scans; 1 for a single scan."""
+        return len(self._lidars_T_body)
+
     @cached_property
     def narrow(self) -> bool:
         """Whether it was merged from scans that see little around the sensor."""
-        if len(self._lidars_T_body) == 1:
+        if self.merged == 1:
             return False
         number = int(np.bincount(self._owner).argmax())
         own = transform(self._lidars_T_body[number], self.points[self._owner == number])
