@@ -18,6 +18,8 @@ from rclpy.qos import QoSReliabilityPolicy, qos_profile_sensor_data
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import Image
 
+from umf_ros.sensors.topic_finder import is_own
+
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 SILENT_S = 5.0
 """Silence of an input that is reported, by the machine's clock."""
@@ -118,8 +120,7 @@ class InputWatch:
     def _others(self) -> list[str]:
         """Return the topics of the same type that are published: the sensor may have another topic."""
         names = [name for name, types in self._node.get_topic_names_and_types() if self._type in types]
-        # closures have the type of odometry
-        fit = [name for name in names if name != self.topic and name.rpartition("/")[2] != "loop_closures"]
+        fit = [name for name in names if name != self.topic and not is_own(name)]
         return [name for name in fit if self._node.count_publishers(name)][:5]
 
 

@@ -20,6 +20,11 @@ _IMAGES = ("image_rect", "image_rect_color", "image_mono", "image", "image_color
 _NO_PICTURES = ("depth", "mask", "semantic")
 
 
+def is_own(topic: str) -> bool:
+    """Return whether this package publishes a topic: closures have the type of odometry, maps that of scans."""
+    return any(own in topic for own in _OWN)
+
+
 class FoundTopics(NamedTuple):
     """Topics by input, and the candidates of inputs for which there are several, which have no topic."""
 
@@ -41,7 +46,7 @@ def find_topics(types: Mapping[str, str]) -> FoundTopics:
     is called left. Cameras without a camera_info count where no camera has one.
     """
     fits = {
-        name: sorted(topic for topic, kind in types.items() if kind in kinds and not any(own in topic for own in _OWN))
+        name: sorted(topic for topic, kind in types.items() if kind in kinds and not is_own(topic))
         for name, kinds in TYPES.items()
     }
     cameras = _cameras({topic: types[topic] for topic in fits["left_image"]})
