@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 ENVIRONMENT = {
     **os.environ,
@@ -75,6 +76,17 @@ class Process:
             self._process.kill()
         self._process.wait()
         self._file.close()
+
+
+def call_service(node: Any, kind: type, service: str, request: object) -> Any:
+    """Call a service of another process and return its response."""
+    import rclpy
+
+    client = node.create_client(kind, service)
+    assert client.wait_for_service(20.0)
+    future = client.call_async(request)
+    assert wait_until(future.done, 40.0, spin=lambda: rclpy.spin_once(node, timeout_sec=0.05))
+    return future.result()
 
 
 def wait_until(

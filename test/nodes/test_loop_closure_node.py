@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from processes import Process, wait_until
+from processes import Process, call_service, wait_until
 from rclpy.node import Node
 from recordings import POINT
 from sensor_msgs.msg import Image, PointCloud2, PointField
@@ -94,11 +94,7 @@ class Rig(Node):
         return wait_until(condition, timeout_s, spin=lambda: rclpy.spin_once(self, timeout_sec=0.05))
 
     def call(self, kind: type, service: str, request: object) -> object:
-        client = self.create_client(kind, f"/loop_closure_node/{service}")
-        assert client.wait_for_service(20.0)
-        future = client.call_async(request)
-        assert self.until(future.done)
-        return future.result()
+        return call_service(self, kind, f"/loop_closure_node/{service}", request)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from ground import BODY_T_LIDAR, WALL, pose_at, scan
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMessage
-from processes import Process, wait_until
+from processes import Process, call_service, wait_until
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
@@ -89,11 +89,7 @@ class Rig(Node):
         return grid.data[row * grid.info.width + column]
 
     def call(self, service: str) -> Trigger.Response:
-        client = self.create_client(Trigger, f"/map_node/{service}")
-        assert client.wait_for_service(20.0)
-        future = client.call_async(Trigger.Request())
-        self.until(future.done)
-        return future.result()
+        return call_service(self, Trigger, f"/map_node/{service}", Trigger.Request())
 
 
 @pytest.fixture

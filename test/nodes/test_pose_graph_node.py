@@ -18,7 +18,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from processes import Process, wait_until
+from processes import Process, call_service, wait_until
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -97,11 +97,7 @@ class Rig(Node):
         return bool(poses) and from_time(poses[-1].header.stamp) == stamp_ns
 
     def call(self, service: str) -> Trigger.Response:
-        client = self.create_client(Trigger, f"/pose_graph_node/{service}")
-        assert client.wait_for_service(20.0)
-        future = client.call_async(Trigger.Request())
-        self.until(future.done)
-        return future.result()
+        return call_service(self, Trigger, f"/pose_graph_node/{service}", Trigger.Request())
 
 
 def odometry(stamp_ns: int, pose: Array) -> Odometry:

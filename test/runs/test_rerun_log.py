@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from umf_ros.absolute.measurement import AbsoluteReason, AbsoluteVerdict, Aid, write_verdicts
-from umf_ros.core.config import Verification
+from umf_ros.core.config import TerrainSettings, Verification
 from umf_ros.core.errors import ConfigError, OutputError
 from umf_ros.core.frames import Candidate, Frame, Keyframe, State
 from umf_ros.detector import Detection
@@ -33,7 +33,7 @@ def run(path: Path, folder: Path) -> None:
     first, again = take(GROUND, there, 10.0, odom=there), take(GROUND, here, 100.0, odom=here)
     verdicts = Verifier(Verification()).verify(again, [(Candidate(0, first.stamp_ns, 0.7), first)])
     assert verdicts[0].closure is not None
-    log = RerunLog(path)
+    log = RerunLog(path, TerrainSettings())
     for item, detection in zip(
         log.watch([seen(first), seen(again)]),
         [Detection(first.stamp_ns, first), Detection(again.stamp_ns, again, verdicts)],
@@ -74,9 +74,9 @@ def test_the_map_and_verdicts_by_state_are_in_the_file(tmp_path: Path) -> None:
 def test_without_the_package_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ConfigError, match=r"pip install 'umf_ros\[rerun\]'"):
-        RerunLog(tmp_path / "run.rrd")
+        RerunLog(tmp_path / "run.rrd", TerrainSettings())
 
 
 def test_a_file_that_cannot_be_written_is_told_before_the_run(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot write"):
-        RerunLog(tmp_path / "nowhere" / "run.rrd")
+        RerunLog(tmp_path / "nowhere" / "run.rrd", TerrainSettings())

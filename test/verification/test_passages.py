@@ -14,10 +14,11 @@ from umf_ros.core.geometry import Array, make_pose
 from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification.acceptance import refuted
+from umf_ros.verification.hypothesis import known_only
 from umf_ros.verification.passages import locate_along, passage_direction
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import align_scans
-from umf_ros.verification.scan_consistency import ambiguity
+from umf_ros.verification.scan_consistency import ambiguity, compare_scans
 
 ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
 AZIMUTHS = np.radians(np.arange(0.0, 360.0, 0.4))
@@ -161,3 +162,14 @@ def test_a_pose_that_fits_as_well_elsewhere_along_a_passage_becomes_no_closure(n
     verdict = verdict_of(*PAIRS[name], np.eye(4))
     assert verdict.reason in (RejectReason.PASSAGE, RejectReason.IMPROBABLE) and verdict.closure is None
     assert verdict.measurements["passage_lead"] < 1.0
+
+
+def test_in_a_passage_the_measurements_are_those_of_the_pose_that_was_taken() -> None:
+    """The search may have ended elsewhere along the passage."""
+    match, query = corridor(0.0, 1, UNEVEN, 0.3), corridor(1.5, 2, UNEVEN, 0.3)
+    verdict = verdict_of(match, query, shift(-3.0))
+    assert abs(verdict.pose[0, 3] - 1.5) < 0.1
+    expected = known_only(compare_scans(*verdict.scans, verdict.pose))
+    names = compare_scans(match, query, np.eye(4)).keys()
+    assert {name: verdict.measurements[name] for name in names & verdict.measurements.keys()} == expected
+    assert "runner_up" not in verdict.measurements and "rival_far" not in verdict.measurements

@@ -103,7 +103,7 @@ def command(
     if settings.localizing and rerun:
         raise ConfigError("--rerun is for mapping runs: leave it out with --map")
     network = make_detector_embedder(settings)
-    viewer = RerunLog(rerun) if rerun else None
+    viewer = RerunLog(rerun, settings.terrain) if rerun else None
     # a store or a map that cannot be used is reported before there is a folder
     known = settings.database.path or (settings.localizing and not settings.grows_map)
     detector = LoopDetector(settings, network) if known else None

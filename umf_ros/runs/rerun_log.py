@@ -38,20 +38,21 @@ class RerunLog:
 
     Args:
         path: the file to write.
+        terrain: limits of the rover, for the map of the ground.
 
     Raises:
         ConfigError: rerun-sdk is not installed.
         OutputError: the file cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, terrain: TerrainSettings) -> None:
         try:
             import rerun
         except ImportError:
             raise ConfigError("--rerun needs another package: pip install 'umf_ros[rerun]'") from None
         with writing(path):
             path.open("wb").close()
-        self._rerun = rerun
+        self._rerun, self._terrain = rerun, terrain
         self._log = rerun.RecordingStream("umf_ros")
         self._log.save(path)
         self._frame: Frame | None = None
@@ -94,7 +95,7 @@ class RerunLog:
 
     def _show_map(self, folder: Path, driven: Trajectory) -> None:
         """Log the ground, and closures and absolute measurements by state, at the poses of the trajectory."""
-        settings, rerun = TerrainSettings(), self._rerun
+        settings, rerun = self._terrain, self._rerun
         voxels = VoxelMap(settings.cell_m)
         poses, known = driven.at(np.array(list(self._scans), np.int64))
         scans = [(*scan, pose) for scan, pose in zip(self._scans.values(), poses, strict=True)]

@@ -21,9 +21,8 @@ RAY_M = 20.0  # by hand: up to here rays are denser than voxels
 PASSES = 3  # measured on two worlds: with 2, .1 % of a static surface are lost, with 3, .02 %
 # voxels above and below one, also over a gap: thinned scans have a point every 0.25 m; beside it, free voxels would
 # spread over the ground
-_TOUCHING = np.array(
-    [x * (1 << 42) + y * (1 << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-2, -1, 1, 2)]
-)
+_STEPS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-2, -1, 1, 2)], float)
+_TOUCHING = cubes(_STEPS, 1.0) - cubes(np.zeros((1, 3)), 1.0)
 
 PlacedScan = tuple[Points, Array, Array]
 """A scan: points (N, 3) m of the body frame, `body_T_lidar` and `map_T_body` (4, 4)."""

@@ -83,9 +83,7 @@ class Hypothesis:
     @classmethod
     def of(cls, query: Keyframe, candidate: Candidate, match: Keyframe, **known: Any) -> Hypothesis:
         """A hypothesis about a candidate whose keyframe is `match`."""
-        names = ("similarity", "inliers_image", "inliers_cloud", "superfeatures")
-        measurements = known_only({name: float(getattr(candidate, name)) for name in names})
-        return cls(query.stamp_ns, candidate, measurements, keyframes=(query, match), **known)
+        return cls(query.stamp_ns, candidate, measurements_of(candidate), keyframes=(query, match), **known)
 
     @property
     def kind(self) -> str:
@@ -122,6 +120,12 @@ class Hypothesis:
     def reject(self, reason: RejectReason, detail: str = "") -> None:
         """Set the reason why this is no closure."""
         self.reason, self.detail, self.closure = reason, detail, None
+
+
+def measurements_of(candidate: Candidate) -> dict[str, float]:
+    """Return the measurements of a candidate, which no pose changes."""
+    names = ("similarity", "inliers_image", "inliers_cloud", "superfeatures")
+    return known_only({name: float(getattr(candidate, name)) for name in names})
 
 
 def known_only(measurements: dict[str, float]) -> dict[str, float]:

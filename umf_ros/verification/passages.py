@@ -18,6 +18,7 @@ from umf_ros.core.geometry import Array, evenly, invert, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur
 from umf_ros.verification.scan_alignment import run_gicp
+from umf_ros.verification.scan_consistency import shifted
 from umf_ros.verification.visibility import Sight
 
 
@@ -61,7 +62,7 @@ class PassageFit:
     Args:
         match: the matched scan.
         query: the query's scan.
-        every: of the points, each how manieth is compared.
+        every: one in so many points is compared.
     """
 
     def __init__(self, match: PreparedScan, query: PreparedScan, every: int = 1) -> None:
@@ -120,9 +121,8 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
         way = pose[:3, :3] @ theirs
     if way is None:
         return None
-    shifted = np.repeat(pose[None], len(const.PASSAGE_SHIFTS_M), axis=0)
-    shifted[:, :3, 3] += const.PASSAGE_SHIFTS_M[:, None] * way
-    best = shifted[_peaks(PassageFit(match, query, const.SCOUT_EVERY).at(shifted).means)]
+    along = shifted(pose, way, const.PASSAGE_SHIFTS_M)
+    best = along[_peaks(PassageFit(match, query, const.SCOUT_EVERY).at(along).means)]
     aligned = [run_gicp(match, query.sample_cloud, one, const.FINE_REACH_M) for one in best]
     poses = np.stack([pose, *aligned, *best])  # alignments may all end at one pose
     comparison = PassageFit(match, query)

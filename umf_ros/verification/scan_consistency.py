@@ -85,7 +85,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     """
     across = np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1]
     way = np.append(across, 0.0)
-    beside, along = (_shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
+    beside, along = (shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
     peaks = [one for one in alternatives(match, query, pose) if not near(one, pose, const.DISTINCT_M, np.inf)]
     poses = np.stack([pose, *beside, *along, *peaks])
     misfits = _point_misfit(match, query, poses), _point_misfit(query, match, invert(poses))
@@ -104,8 +104,8 @@ def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Arra
     return np.where(count >= const.FEWEST_POINTS, mean, const.RIVAL_MISFIT)
 
 
-def _shifted(pose: Array, way: Array, shifts: Array) -> Array:
+def shifted(pose: Array, way: Array, shifts: Array) -> Array:
     """(K, 4, 4) the pose, shifted by each of (K,) metres along a direction (3,) of the match."""
-    shifted = np.repeat(pose[None], len(shifts), axis=0)
-    shifted[:, :3, 3] += shifts[:, None] * way
-    return shifted
+    poses = np.repeat(pose[None], len(shifts), axis=0)
+    poses[:, :3, 3] += shifts[:, None] * way
+    return poses

@@ -14,7 +14,7 @@ from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading, near
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
-from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only
+from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
 from umf_ros.verification.passages import locate_along
 from umf_ros.verification.pose_search import TemporalMemory, consistent_pixels, find_hypotheses, prior_sigmas
@@ -155,10 +155,12 @@ class Verifier:
         return aligned
 
     def _measure(self, hypothesis: Hypothesis) -> None:
+        """Measure the pose; nothing stays of a pose that was measured before."""
         query, match = hypothesis.keyframes
         prior = prior_sigmas(query, match, hypothesis.pose, self._settings.odometry_drift)
         support = self._memory.support(query, match, hypothesis.pose)
-        hypothesis.measurements |= measure(hypothesis) | known_only({"prior_sigmas": prior, "support": support})
+        of_pose = measure(hypothesis) | known_only({"prior_sigmas": prior, "support": support})
+        hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
     def _look_elsewhere(self, hypothesis: Hypothesis) -> None:
         """Compare with other poses; in a passage, move to the best position along it."""
@@ -170,7 +172,6 @@ class Verifier:
             return
         hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
         self._measure(hypothesis)
-        hypothesis.measurements.pop("runner_up", None)
         hypothesis.measurements["passage_lead"] = found.lead
 
     def _probability(self, hypothesis: Hypothesis) -> float:

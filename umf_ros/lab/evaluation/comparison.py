@@ -272,12 +272,7 @@ def _share_scans(match: PlaceView, query: PlaceView, theirs: Keyframe, ours: Key
     return abs(theirs.path_length_m - ours.path_length_m) < 2 * const.ODOMETRY_REACH_M
 
 
-def judge(
-    verifier: Verifier,
-    match: Keyframe,
-    query: Keyframe,
-    submaps: bool = False,
-) -> Hypothesis:
+def judge(verifier: Verifier, match: Keyframe, query: Keyframe, submaps: bool = False) -> Hypothesis:
     """Verify one pair of keyframes without odometry and without the support of earlier pairs.
 
     Args:
