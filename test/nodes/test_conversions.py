@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 
+from umf_ros.core.config import FrameIds
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import make_pose
@@ -63,3 +66,16 @@ def test_a_pair_to_reject_has_stamps_that_a_message_can_carry(frame: str) -> Non
     assert conversions.parse_pair("keyframe/1 keyframe/2") == (1, 2)
     with pytest.raises(MessageError, match="expected 'keyframe/<match ns> keyframe/<query ns>'"):
         conversions.parse_pair(f"{frame} keyframe/2")
+
+
+def test_the_poses_of_a_long_path_stay_in_longer_ones() -> None:
+    rng = np.random.default_rng(0)
+    stamps = np.cumsum(rng.integers(1, 10**9, 9000))
+    found = []
+    for count in (1, 2, 1999, 2000, 2001, 5000, 9000):
+        message = conversions.path(stamps[:count], np.tile(np.eye(4), (count, 1, 1)), FrameIds())
+        found.append([conversions.from_time(pose.header.stamp) for pose in message.poses])
+        assert len(found[-1]) <= conversions.MAX_POSES and found[-1][-1] == stamps[count - 1]
+        assert len(found[-1]) == count or len(found[-1]) > conversions.MAX_POSES / 4
+    for earlier, later in itertools.pairwise(found):
+        assert {stamp for stamp in later if stamp < earlier[-1]} <= set(earlier)

@@ -1,9 +1,12 @@
 import numpy as np
+import pytest
 from ground import BODY_T_LIDAR, WALL, pose_at, scan
+from scipy.spatial.transform import Rotation
 
 from umf_ros.core.config import TerrainSettings
 from umf_ros.core.geometry import Array, make_pose
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.terrain import living_map
 from umf_ros.terrain.living_map import LivingMap
 
 SECOND = 10**9
@@ -60,7 +63,10 @@ def test_a_thinned_path_places_scans_by_the_odometry_between_its_poses() -> None
     living.correct(Trajectory(np.arange(0, 20, 4) * SECOND, there[::4]))
     assert living.update()
     assert living.voxels.scans == 17  # up to the last pose of the path
-    np.testing.assert_allclose(living._poses, there[:17], atol=1e-9)
+    shown = living.voxels.points()
+    living.correct(Trajectory(np.arange(20) * SECOND, there))  # all of its poses
+    living.update()
+    assert living.rebuilt == 0 and len(living.voxels.points()) >= len(shown)
 
 
 def test_a_session_that_is_not_in_the_map_is_left_out() -> None:
@@ -80,3 +86,39 @@ def test_a_clock_that_is_set_back_begins_a_new_map() -> None:
     living.update()
     living.add_odometry(0, pose_at(0.0))
     assert len(living.voxels) == 0 and living.newest_ns == 0
+
+
+def test_memory_stops_growing_on_the_same_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(living_map, "LATEST", 100)
+    angles = np.deg2rad(np.arange(0.0, 360.0, 6.0))
+    places = 6.0 * np.column_stack([np.sin(angles), 1 - np.cos(angles), np.zeros(len(angles))])
+    loop = np.stack(
+        [make_pose(Rotation.from_euler("z", a).as_matrix(), at) for a, at in zip(angles, places, strict=True)]
+    )
+    seen = [scan(pose, WALL) for pose in loop]
+    living, sizes = LivingMap(TerrainSettings()), []
+    for lap in range(8):
+        for row, pose in enumerate(loop):
+            stamp_ns = (lap * len(loop) + row) * SECOND
+            drift = make_pose(np.eye(3), [0.0, 0.3 * stamp_ns / (len(loop) * SECOND), 0.0])
+            living.add_odometry(stamp_ns, drift @ pose)
+            living.add_scan(stamp_ns, seen[row], BODY_T_LIDAR[:3, 3])
+        driven = np.tile(loop, (lap + 1, 1, 1))
+        rows = np.append(np.arange(0, len(driven) - 1, 2 ** (1 + lap // 2)), len(driven) - 1)
+        living.correct(Trajectory(rows * SECOND, driven[rows]))
+        assert living.update() and living.waiting == 0
+        sizes.append((*living.kept, len(living.voxels)))
+    scans, odometry, voxels = np.array(sizes).T
+    assert scans.max() < 1.2 * scans[1] and odometry.max() < 100 + 2 * (scans.max() + len(rows))
+    assert voxels[-1] < 1.1 * voxels[1]
+    living.correct(Trajectory(rows * SECOND, make_pose(np.eye(3), [0.0, 3.0, 0.0]) @ driven[rows]))
+    assert living.update() and living.rebuilt == 1 and abs(wall_y(living) - 8.8) < 0.3
+    assert len(living.voxels) > 0.9 * voxels[-1]
+
+
+def test_scans_without_a_path_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(living_map, "WAITING", 5)
+    living = driven()
+    assert not living.update() and living.kept == (5, len(METRES))
+    living.correct(path(straight()))
+    assert living.update() and living.voxels.scans == 5 and living.newest_ns == 19 * SECOND

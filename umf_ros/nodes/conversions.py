@@ -20,7 +20,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from umf_ros.core.config import FrameIds, Qos
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import LoopClosure, State
-from umf_ros.core.geometry import Array, evenly, from_quaternion, to_quaternion
+from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose
 
 
@@ -219,13 +219,23 @@ def _keyframe_stamp(frame: str) -> int:
 
 MAX_POSES, MAX_LINES = 2000, 500
 """Most poses of a path: RViz redraws every line; messages stay small on long drives."""
+SHORTEST_PERIOD_NS = 10**8
+"""Period of the poses of a path that is too long for all."""
 
 
 def path(stamps_ns: NDArray[np.int64], map_T_body: Array, frames: FrameIds) -> Path:
-    """Return the trajectory as a path, evenly thinned to at most `MAX_POSES` poses."""
+    """Return the trajectory as a path of at most `MAX_POSES` poses: the first of every period, and the last of all.
+
+    The period doubles as the drive grows, so that the poses of a path are also in all earlier paths that reach so far.
+    """
     if not len(stamps_ns):
         return Path(header=Header(frame_id=frames.map))
-    rows = evenly(len(stamps_ns), MAX_POSES)
+    last, period_ns = len(stamps_ns) - 1, SHORTEST_PERIOD_NS
+    rows = np.arange(last)
+    while len(rows) >= MAX_POSES:
+        rows = np.flatnonzero(np.diff(stamps_ns[:last] // period_ns, prepend=-1))
+        period_ns *= 2
+    rows = np.append(rows, last)
     both = zip(stamps_ns[rows].tolist(), to_poses(map_T_body[rows]), strict=True)
     poses = [PoseStamped(header=to_header(stamp, frames.map), pose=pose) for stamp, pose in both]
     return Path(header=to_header(int(stamps_ns[-1]), frames.map), poses=poses)

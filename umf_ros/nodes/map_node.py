@@ -31,6 +31,8 @@ from umf_ros.terrain.grid import TerrainGrid, make_grid, write_terrain
 from umf_ros.terrain.living_map import LivingMap
 
 ODOMETRY_DEPTH, SCAN_DEPTH, QUEUE = 200, 50, 10_000
+MOST_ADDED = 10_000
+"""Scans and odometry messages after which the map is updated also without subscribers: an update frees memory."""
 RESTING = 4.0
 """Least pause between two updates, as a multiple of their duration: a large map takes one core a fifth of the time."""
 
@@ -88,8 +90,9 @@ class MapNode(BaseNode):
         self._path = message  # the newest one is decoded when there is an update
 
     def _tick(self) -> None:
-        listening = any(publisher.get_subscription_count() for publisher in self._publishers_of.values())
-        if listening and not self._queued and time.monotonic() >= self._due_s:
+        wanted = self._map.added > MOST_ADDED
+        wanted = wanted or any(publisher.get_subscription_count() for publisher in self._publishers_of.values())
+        if wanted and not self._queued and time.monotonic() >= self._due_s:
             self._queued = True
             self._worker.submit(self._show)
         self._diagnose(self._judge(self._own_status()))
@@ -132,10 +135,13 @@ class MapNode(BaseNode):
         return f"map.yaml and map.pgm written to {folder}" + (f"; {missing}" if missing else ", and elevation.tif")
 
     def _own_status(self) -> DiagnosticStatus:
+        scans, odometry = self._map.kept
         values = {
             **self._faults,
             "keyframes": self._map.voxels.scans,
             "keyframes_waiting": self._map.waiting,
+            "scans_in_memory": scans,
+            "odometry_in_memory": odometry,
             "voxels": len(self._map.voxels),
             "rebuilt": self._map.rebuilt,
             "bytes_published": self._bytes,
