@@ -113,8 +113,7 @@ class Verifier:
     ) -> list[Hypothesis]:
         """The best hypotheses about some candidates, judged."""
         with self._timed("refine"):
-            hypotheses = self._hypotheses(query, ranked, turned, guesses)[: const.MAX_REFINED]
-            return self._judge(hypotheses, self._settings.min_probability)
+            return self._judge(self._hypotheses(query, ranked, turned, guesses), self._settings.min_probability)
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -140,19 +139,25 @@ class Verifier:
         return sorted(found, key=lambda one: -one.score)
 
     def _judge(self, hypotheses: list[Hypothesis], least: float) -> list[Hypothesis]:
-        """Align and measure hypotheses, and judge each beside the others about its candidate.
+        """Align and measure the first hypotheses, and judge each beside the others about its candidate.
 
-        The slow tests are left out where they cannot change the decision.
+        The others are only aligned where one of these is promising: the right pose may be among them. The slow tests
+        are left out where they cannot change the decision.
         """
-        aligned = self._aligned(hypotheses)
-        for one in aligned:
-            self._measure(one)
+        aligned = self._aligned(hypotheses[: const.MAX_REFINED], [])
+        promising = [one.candidate for one in aligned if self._promises(one, least)]
+        others = [one for one in hypotheses[const.MAX_REFINED :] if any(one.candidate is it for it in promising)]
+        aligned += self._aligned(others, aligned)
         for one in aligned:
             one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
-            if one.scans and self._acceptance.at_best(one.measurements) >= least:
+            if self._promises(one, least):
                 self._look_elsewhere(one)
             one.probability = self._probability(one)
         return aligned
+
+    def _promises(self, hypothesis: Hypothesis, least: float) -> bool:
+        """Whether a hypothesis of scans can be so probable."""
+        return bool(hypothesis.scans) and self._acceptance.at_best(hypothesis.measurements) >= least
 
     def _measure(self, hypothesis: Hypothesis) -> None:
         """Measure the pose; nothing stays of a pose that was measured before."""
@@ -184,14 +189,20 @@ class Verifier:
             return 0.0
         return found / (found + const.BARE_ODDS * (1.0 - found))
 
-    def _aligned(self, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
-        """Each aligned; of those that begin or end where another of the same candidate ended, only the first."""
+    def _aligned(self, hypotheses: list[Hypothesis], before: list[Hypothesis]) -> list[Hypothesis]:
+        """Each aligned and measured; of those that begin or end where another of its candidate ended, only the first.
+
+        Args:
+            hypotheses: the most promising first.
+            before: those that are aligned already.
+        """
         kept: list[Hypothesis] = []
         for one in hypotheses:
-            ends = [other.pose for other in kept if other.candidate is one.candidate]
+            ends = [other.pose for other in before + kept if other.candidate is one.candidate]
             if not _ends_at(one, ends):
                 self._align(one)
                 if not _ends_at(one, ends):
+                    self._measure(one)
                     kept.append(one)
         return kept
 
