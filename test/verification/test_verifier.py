@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 
 from umf_ros.core.config import Verification
-from umf_ros.core.frames import Candidate, Keyframe, ScanMotion
+from umf_ros.core.frames import Candidate, Embedding, Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, make_pose, near, relative, rotation_angle
+from umf_ros.lab.scan_files import UNCALIBRATED
+from umf_ros.lab.simulation.domains.pairs import is_wrong
+from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, Domain, survey
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
 from umf_ros.verification.hypothesis import SCAN
+from umf_ros.verification.prepared_scan import thin_scan
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
 LEAST = 0.7  # probability of a right pose where nothing stands up from the ground
@@ -323,3 +327,26 @@ def test_where_both_scans_show_bare_ground_the_images_tell_the_pose() -> None:
     blind = [without_image(on_even_ground(one)) for one in (query, match)]
     asked.reset()
     assert asked.verify(blind[0], [candidate(blind[1])])[0].closure is None
+
+
+def test_a_pose_is_compared_with_hypotheses_that_ranked_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a room whose ends look alike the right pose can rank behind the one that is turned by 180 deg."""
+    monkeypatch.setattr(const, "MAX_REFINED", 1)
+    domain = Domain("solid360", "rooms", "tilted")
+    scans = survey(domain, 20052, 4.0, 24.0)
+    accepted = 0
+    for query in (scan for scan in scans if scan.label == OTHER_WAY):
+        for match in (scan for scan in scans if scan.label == FIRST):
+            true = relative(match.world_T_body, query.world_T_body)
+            if np.linalg.norm(true[:3, 3]) < 2.0:
+                now, before = snapshot(query.sweep.points, 9.0), snapshot(match.sweep.points, 1.0)
+                found = Verifier(Verification()).verify(now, [candidate(before)])[0]
+                accepted += found.accepted
+                assert not (found.accepted and is_wrong(found.pose, true))
+    assert accepted >= 4
+
+
+def snapshot(points: Array, at_s: float) -> Keyframe:
+    """The keyframe of a scan that nothing else is known of."""
+    blind = Embedding(np.empty(0, np.float32))
+    return Keyframe(round(at_s * 1e9), blind, UNCALIBRATED.camera, np.eye(4), thin_scan(points))
