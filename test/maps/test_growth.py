@@ -20,10 +20,9 @@ from umf_ros.core.config import Database, Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.localizer import read_poses
-from umf_ros.maps.growth import grow
 from umf_ros.maps.joint_graph import solve
 from umf_ros.maps.map_folder import MapFolder
-from umf_ros.maps.mapping import open_places
+from umf_ros.maps.mapping import grow, open_places
 from umf_ros.maps.outputs import write_results
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import stored_identity, stored_sessions

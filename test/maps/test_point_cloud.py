@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 
 from umf_ros.lab.scan_files import parse_pcd, parse_ply
-from umf_ros.maps.point_cloud import MapCloud, write_pcd, write_ply
+from umf_ros.maps.outputs import MapCloud, write_pcd, write_ply
 from umf_ros.runs.gallery import HeightMap
 
 

@@ -9,8 +9,8 @@ from std_srvs.srv import Trigger
 from vlp16_rover import CALIBRATION, Vlp16Rover
 
 from umf_ros.core.config import Settings
-from umf_ros.maps.growth import grow
 from umf_ros.maps.map_folder import MapFolder
+from umf_ros.maps.mapping import grow
 
 MODULE = "umf_ros.nodes.loop_closure_node"
 

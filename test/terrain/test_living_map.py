@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.config import TerrainSettings
 from umf_ros.core.geometry import Array, make_pose
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.terrain import living_map
-from umf_ros.terrain.living_map import LivingMap
+from umf_ros.terrain import voxels
+from umf_ros.terrain.voxels import LivingMap
 
 SECOND = 10**9
 METRES = np.arange(0.0, 10.0, 0.5)
@@ -89,7 +89,7 @@ def test_a_clock_that_is_set_back_begins_a_new_map() -> None:
 
 
 def test_memory_stops_growing_on_the_same_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(living_map, "LATEST", 100)
+    monkeypatch.setattr(voxels, "LATEST", 100)
     angles = np.deg2rad(np.arange(0.0, 360.0, 6.0))
     places = 6.0 * np.column_stack([np.sin(angles), 1 - np.cos(angles), np.zeros(len(angles))])
     loop = np.stack(
@@ -108,16 +108,16 @@ def test_memory_stops_growing_on_the_same_loop(monkeypatch: pytest.MonkeyPatch) 
         living.correct(Trajectory(rows * SECOND, driven[rows]))
         assert living.update() and living.waiting == 0
         sizes.append((*living.kept, len(living.voxels)))
-    scans, odometry, voxels = np.array(sizes).T
+    scans, odometry, cells = np.array(sizes).T
     assert scans.max() < 1.2 * scans[1] and odometry.max() < 100 + 2 * (scans.max() + len(rows))
-    assert voxels[-1] < 1.1 * voxels[1]
+    assert cells[-1] < 1.1 * cells[1]
     living.correct(Trajectory(rows * SECOND, make_pose(np.eye(3), [0.0, 3.0, 0.0]) @ driven[rows]))
     assert living.update() and living.rebuilt == 1 and abs(wall_y(living) - 8.8) < 0.3
-    assert len(living.voxels) > 0.9 * voxels[-1]
+    assert len(living.voxels) > 0.9 * cells[-1]
 
 
 def test_scans_without_a_path_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(living_map, "WAITING", 5)
+    monkeypatch.setattr(voxels, "WAITING", 5)
     living = driven()
     assert not living.update() and living.kept == (5, len(METRES))
     living.correct(path(straight()))

@@ -156,7 +156,7 @@ def grow_map(
     """
     from rich.console import Console
 
-    from umf_ros.maps.growth import grow
+    from umf_ros.maps.mapping import grow
 
     console = Console()
     with console.status("Solving the joint graph"):
@@ -179,7 +179,7 @@ def export(
     from umf_ros.core.config import load_settings
     from umf_ros.core.io import check_writable
     from umf_ros.maps.map_folder import MapFolder
-    from umf_ros.maps.point_cloud import export_terrain
+    from umf_ros.maps.outputs import export_terrain
 
     target, folder = MapFolder.open(map_folder), out or map_folder
     settings = (load_settings(config) if config else target.settings).terrain

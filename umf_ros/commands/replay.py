@@ -164,7 +164,7 @@ def _grow(console: Console, settings: Settings, folder: Path) -> None:
     """Make what was seen while localising a session of the map, where that is asked for."""
     if not settings.grows_map:
         return
-    from umf_ros.maps.growth import grow
+    from umf_ros.maps.mapping import grow
     from umf_ros.maps.outputs import sentence
 
     session, summary = grow(Path(settings.map), folder)

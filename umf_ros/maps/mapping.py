@@ -6,11 +6,17 @@ Three steps, each a function of files alone, so that the first two can run on an
 2. `match_session`: closures between a recording and the earlier ones;
 3. `umf_ros.maps.joint_graph.solve`: one graph of all sessions.
 
+`grow` adds what a rover saw where it localises: the session is complete in a folder of its own, and its places are in
+the store, before `map.json` names it in one step. Until then the map is what it was, whatever is killed; after that the
+same drive is not added again. Poses of the new places come with the solution, which is repeated where it was cut off.
+
 A recording or map that cannot be read raises an `UmfError`, a folder that cannot be written an `OutputError`.
 """
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -25,17 +31,19 @@ from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.config import Database, Settings, Verification
-from umf_ros.core.errors import BagError, writing
+from umf_ros.core.errors import BagError, UmfError, writing
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
-from umf_ros.core.io import write_table
+from umf_ros.core.io import lock_file, write_table
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
+from umf_ros.maps.joint_graph import solve
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
+from umf_ros.maps.outputs import write_results
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
-from umf_ros.runs.run_file import CLOSURES, RunFile, StoredOdometry, closure_row
+from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, StoredOdometry, closure_row
 from umf_ros.runs.writer import PLACES, count_drops
 from umf_ros.submaps import SubmapFinder
 from umf_ros.verification import Hypothesis, Verifier
@@ -44,6 +52,8 @@ OnFrame = Callable[[float, Detection], None]
 """Called for every frame with the processed share of the recording, 0 to 1, and the detection."""
 _UNKNOWN = np.diag([np.inf] * 6)
 RECORDINGS = (".mcap", ".db3", ".bag")
+FEWEST = 2
+"""Places of a session: one alone has no odometry to anything."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,3 +299,75 @@ def _discard_unfinished(target: MapFolder) -> None:
 def open_places(path: Path) -> PlaceDatabase:
     """Open a place database of any embedder for reading."""
     return PlaceDatabase(Database(path=str(path)), *stored_identity(path), read_only=True)
+
+
+def grow(map_folder: Path, run: Path) -> tuple[MapSession | None, dict[str, Any]]:
+    """Add what a rover saw in a run that localised, since the run was added last, and solve the map.
+
+    Args:
+        map_folder: the map.
+        run: run folder with the places that the rover saw; it may go on.
+
+    Returns:
+        The new session, None where there is nothing new, and the summary of the map.
+
+    Raises:
+        UmfError: either is missing or damaged, or another process adds to the map.
+        OutputError: the map cannot be written.
+    """
+    if not (run / PLACES).is_file():
+        raise UmfError(f"{run} holds no places: localization.update keeps them while a rover localises")
+    lock = lock_file(map_folder / "map.json")
+    try:
+        target = MapFolder.open(map_folder)
+        new = _new_places(target, run)
+        session = _add_run(target, run, new) if len(new) >= FEWEST else None
+        if session is None and _is_solved(target):
+            return None, json.loads((target.path / "summary.json").read_text(encoding="utf-8"))
+        return session, write_results(target, solve(target))
+    finally:
+        os.close(lock)
+
+
+def _new_places(target: MapFolder, run: Path) -> list[Keyframe]:
+    """Places of a run, with odometry, that are in no session of the map."""
+    known = [one for one in target.sessions if one.recording["path"] == str(run.resolve())]
+    with closing(open_places(run / PLACES)) as own:
+        found = [own[row] for row in range(len(own))]
+    return [
+        one
+        for one in found
+        if one.odom_T_body is not None and not any(s.first_ns <= one.stamp_ns <= s.last_ns for s in known)
+    ]
+
+
+def _add_run(target: MapFolder, run: Path, new: list[Keyframe]) -> MapSession:
+    """Write the run folder of a session from its places, and add these to the map."""
+    name, stamps = target.free_name(run), [one.stamp_ns for one in new]
+    folder = target.folder_of(name)
+    with writing(folder):
+        rmtree(folder, ignore_errors=True)  # of a process that was killed
+        folder.mkdir(parents=True)
+    with closing(RunFile(folder)) as file:
+        for number, one in enumerate(new):
+            assert one.odom_T_body is not None
+            file.append_odometry(number, StoredOdometry(one.stamp_ns, one.odom_T_body))
+    keyframes = [[one.stamp_ns, one.session, f"{one.path_length_m:.4f}"] for one in new]
+    write_table(folder / "keyframes.csv", COLUMNS["keyframes"], keyframes)
+    write_table(folder / "closures.csv", CLOSURES, [])
+    shift_ns, places = target.shift_for(min(stamps)), set(stamps)
+    with closing(RunFile(run, read_only=True)) as file:
+        between = [one for one in file.closures() if one.query_stamp_ns in places]
+    moved = [replace(one, query_stamp_ns=one.query_stamp_ns + shift_ns) for one in between]
+    write_table(folder / BETWEEN, CLOSURES, [closure_row(one, float("nan")) for one in moved])
+    about = {"path": str(run.resolve()), "start_ns": min(stamps), "end_ns": max(stamps), "messages": {}}
+    return add_places(target, name, new, stored_identity(run / PLACES), about)
+
+
+def _is_solved(target: MapFolder) -> bool:
+    """Whether the results of a map are about all of its sessions."""
+    try:
+        summary = json.loads((target.path / "summary.json").read_text(encoding="utf-8"))
+        return [one["name"] for one in summary["sessions"]] == [one.name for one in target.sessions]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False

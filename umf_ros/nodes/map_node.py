@@ -28,7 +28,7 @@ from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.sensors.decode import decode_odometry, stamp_ns
 from umf_ros.sensors.topic_finder import BACK_END
 from umf_ros.terrain.grid import TerrainGrid, make_grid, write_terrain
-from umf_ros.terrain.living_map import LivingMap
+from umf_ros.terrain.voxels import LivingMap
 
 ODOMETRY_DEPTH, SCAN_DEPTH, QUEUE = 200, 50, 10_000
 MOST_ADDED = 10_000
