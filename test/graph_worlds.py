@@ -10,13 +10,13 @@ import numpy as np
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, expmap, invert, make_pose, relative
-from umf_ros.lab.datasets.g2o import G2oGraph, GraphRecording
+from umf_ros.lab.datasets.g2o import Edge, G2oGraph, GraphRecording
 from umf_ros.lab.datasets.g2o import drive as drive_recording
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, WorldClosure
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import Closures, PlacedClosure, State, as_closures
 from umf_ros.pose_graph.odometry import OdometryChain
-from umf_ros.pose_graph.solver import Edge, between
+from umf_ros.pose_graph.solver import between
 
 SETTINGS = PoseGraphSettings(keyframe_spacing_m=1e-6, max_gap_s=1.5)
 LAP = 100
@@ -122,10 +122,10 @@ def batch_optimum(world: GraphWorld) -> Array:
     for k, pose in enumerate(world.truth):
         values.insert(k, gtsam.Pose3(pose))
         if k:
-            graph.add(between(Edge(k - 1, k, steps[k - 1], world.step_covariances[k])))
+            graph.add(between(k - 1, k, steps[k - 1], world.step_covariances[k]))
     for c in world.closures:
         if c.right:
-            graph.add(between(Edge(c.first, c.second, c.pose, c.covariance)))
+            graph.add(between(c.first, c.second, c.pose, c.covariance))
     for _ in range(3):
         values = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
     return np.stack([values.atPose3(k).matrix() for k in range(len(world.truth))])

@@ -47,7 +47,7 @@ from umf_ros.lab.simulation.pose_graphs import (
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.consistency import NoiseScale
-from umf_ros.pose_graph.solver import Edge, between
+from umf_ros.pose_graph.solver import between
 
 FIRST_SEED = 20_000
 MOST_CLOSURES_OF_A_FILE = 1500
@@ -125,13 +125,13 @@ def odometry_graph(world: GraphWorld, scale: NoiseScale = STATED) -> gtsam.Nonli
     steps = invert(world.odometry[:-1]) @ world.odometry[1:]
     for k in range(len(world.odometry)):
         if k not in world.chains:
-            graph.add(between(Edge(k - 1, k, steps[k - 1], scale.odometry**2 * world.step_covariances[k])))
+            graph.add(between(k - 1, k, steps[k - 1], scale.odometry**2 * world.step_covariances[k]))
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(world.odometry[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
     return graph
 
 
 def closure_factor(closure: WorldClosure, scale: NoiseScale = STATED) -> gtsam.BetweenFactorPose3:
-    return between(Edge(closure.first, closure.second, closure.pose, scale.closures**2 * closure.covariance))
+    return between(closure.first, closure.second, closure.pose, scale.closures**2 * closure.covariance)
 
 
 def as_values(poses: Array) -> gtsam.Values:

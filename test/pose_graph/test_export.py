@@ -26,6 +26,7 @@ from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import make_pose
 from umf_ros.lab.datasets.g2o import (
     PERIOD_NS,
+    Edge,
     as_recording,
     drive,
     read_g2o,
@@ -35,7 +36,6 @@ from umf_ros.lab.datasets.g2o import (
 )
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, verdict_table
-from umf_ros.pose_graph.solver import Edge
 
 WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))
 

@@ -202,7 +202,7 @@ def test_the_newest_pose_has_the_marginal_of_the_full_graph() -> None:
     import gtsam
 
     from umf_ros.core.geometry import ros_to_gtsam_covariance
-    from umf_ros.pose_graph.solver import Edge, between
+    from umf_ros.pose_graph.solver import between
 
     world = rover_loops(300, 12)
     graph = drive(world)
@@ -213,9 +213,9 @@ def test_the_newest_pose_has_the_marginal_of_the_full_graph() -> None:
     for k, pose in enumerate(poses):
         values.insert(k, gtsam.Pose3(pose))
         if k:
-            full.add(between(Edge(k - 1, k, steps[k - 1], world.step_covariances[k])))
+            full.add(between(k - 1, k, steps[k - 1], world.step_covariances[k]))
     for closure in world.closures:
-        full.add(between(Edge(closure.first, closure.second, closure.pose, closure.covariance)))
+        full.add(between(closure.first, closure.second, closure.pose, closure.covariance))
     expected = gtsam.Marginals(full, values).marginalCovariance(len(poses) - 1)
     found = ros_to_gtsam_covariance(graph.covariance(), poses[-1])
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=1e-5)

@@ -10,7 +10,7 @@ from umf_ros.core.geometry import invert
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.odometry import PathPoints
-from umf_ros.pose_graph.solver import Edge, between
+from umf_ros.pose_graph.solver import between
 
 
 def stop(graph: PoseGraph, *poses: int) -> PathPoints:
@@ -28,9 +28,9 @@ def test_the_bound_of_a_relative_covariance_is_never_below_the_true_one() -> Non
     for k, pose in enumerate(solved.trajectory()[1]):
         values.insert(k, gtsam.Pose3(pose))
         if k:
-            full.add(between(Edge(k - 1, k, steps[k - 1], world.step_covariances[k])))
+            full.add(between(k - 1, k, steps[k - 1], world.step_covariances[k]))
     for closure in world.closures:
-        full.add(between(Edge(closure.first, closure.second, closure.pose, closure.covariance)))
+        full.add(between(closure.first, closure.second, closure.pose, closure.covariance))
     for i, j in [(3, 290), (60, 61), (20, 120), (250, 40)]:
         anchored = gtsam.NonlinearFactorGraph(full)
         anchored.add(gtsam.PriorFactorPose3(i, values.atPose3(i), gtsam.noiseModel.Isotropic.Sigma(6, 1e-9)))

@@ -25,7 +25,7 @@ from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
 from umf_ros.pose_graph.odometry import CorrectedPath
-from umf_ros.pose_graph.solver import Edge, between
+from umf_ros.pose_graph.solver import between
 
 GAUGE = expmap(np.array([[0.05, -0.1, 2.5, 40, -25, 3]]))[0]
 
@@ -174,7 +174,7 @@ def full_optimum(rows: list[int], poses: list[Array], last: int) -> Array:
         values.insert(k, gtsam.Pose3(DRIFTING.odometry[k]))
         if k:
             step = invert(DRIFTING.odometry[k - 1]) @ DRIFTING.odometry[k]
-            graph.add(between(Edge(k - 1, k, step, DRIFTING.step_covariances[k])))
+            graph.add(between(k - 1, k, step, DRIFTING.step_covariances[k]))
     for row, pose in zip(rows, poses, strict=True):
         graph.add(gtsam.PriorFactorPose3(row, gtsam.Pose3(pose), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()

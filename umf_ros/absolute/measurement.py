@@ -159,25 +159,42 @@ def decode_fix(message: Any, stamp_ns: int, lever: Array) -> AbsoluteMeasurement
     return found
 
 
-class GravityFilter:
-    """Filter of sensor_msgs/Imu messages that gives upward directions, at most two per second.
+class AbsoluteDecoder:
+    """Decoder of GNSS and IMU messages, live and offline.
 
-    They come from the orientation if the driver states one, else from the mean acceleration over a second at rest.
+    An IMU gives at most two upward directions per second: from the orientation if the driver states one, else from the
+    mean acceleration over a second at rest.
+
+    Args:
+        antenna: (3,) m, body frame.
+        body_T_imu: (4, 4).
+        find: returns the pose (4, 4) of a frame on the body by `/tf_static`, which has priority; None if it is unknown.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, antenna: Array, body_T_imu: Array, find: Callable[[str], Array | None]) -> None:
+        self._antenna, self._body_T_imu, self._find = antenna, body_T_imu, find
         self._window: deque[tuple[int, Array, Array]] = deque()
         self._last_ns = -(10**18)
 
-    def take(self, message: Any, stamp_ns: int, body_R_imu: Array) -> AbsoluteMeasurement | None:
-        """Add one message of an IMU with the rotation (3, 3) on the body; return a measurement if one is due.
+    def decode(self, source: Aid, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
+        """Return the measurement in a message; None if an IMU has none yet.
 
         Raises:
-            MessageError: of kind "imu": its orientation is not a rotation.
+            MessageError: the message cannot be used.
         """
-        self._body_R_imu = body_R_imu
-        if message.orientation_covariance[0] < 0:
-            return self._at_rest(message, stamp_ns)
+        mounted = self._find(message.header.frame_id)
+        if source is Aid.GNSS:
+            return decode_fix(message, stamp_ns, self._antenna if mounted is None else mounted[:3, 3])
+        is_oriented = not message.orientation_covariance[0] < 0
+        found = self._by_orientation(message, stamp_ns) if is_oriented else self._at_rest(message, stamp_ns)
+        if found is None:
+            return None
+        (up_imu, sigma), self._last_ns = found, stamp_ns
+        up = (self._body_T_imu if mounted is None else mounted)[:3, :3] @ up_imu
+        return AbsoluteMeasurement(Aid.GRAVITY, stamp_ns, up / np.linalg.norm(up), sigma**2 * np.eye(3), np.zeros(3))
+
+    def _by_orientation(self, message: Any, stamp_ns: int) -> tuple[Array, float] | None:
+        """Return the upward direction in the IMU by its orientation, and its sigma, if one is due."""
         if 0 <= stamp_ns - self._last_ns < 500_000_000:
             return None
         turn = message.orientation
@@ -188,10 +205,10 @@ class GravityFilter:
         spread = np.asarray(message.orientation_covariance, float).reshape(3, 3)[:2, :2]
         stated = float(np.sqrt(max(np.trace(spread) / 2, 0.0))) if np.isfinite(spread).all() else 0.0
         sigma = max(stated, float(_LEAST_ATTITUDE_SIGMA)) if stated else float(_ATTITUDE_SIGMA)
-        return self._measured(world_T_imu[2, :3], sigma, stamp_ns)
+        return world_T_imu[2, :3], sigma
 
-    def _at_rest(self, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
-        """Return the direction of the mean acceleration over the last second, if the IMU was at rest."""
+    def _at_rest(self, message: Any, stamp_ns: int) -> tuple[Array, float] | None:
+        """Return the direction of the mean acceleration over the last second, and its sigma, if the IMU was at rest."""
         force, rate = (
             [vector.x, vector.y, vector.z] for vector in (message.linear_acceleration, message.angular_velocity)
         )
@@ -208,38 +225,7 @@ class GravityFilter:
         moves = np.ptp(rates, axis=0).max() > _REST_RAD_S or forces.std(axis=0).max() > _REST_M_S2
         if moves or not abs(size - _GRAVITY_M_S2) < _GRAVITY_TOLERANCE:
             return None
-        return self._measured(mean / size, float(_ATTITUDE_SIGMA), stamp_ns)
-
-    def _measured(self, up_imu: Array, sigma: float, stamp_ns: int) -> AbsoluteMeasurement:
-        self._last_ns = stamp_ns
-        up = self._body_R_imu @ up_imu
-        return AbsoluteMeasurement(Aid.GRAVITY, stamp_ns, up / np.linalg.norm(up), sigma**2 * np.eye(3), np.zeros(3))
-
-
-class AbsoluteDecoder:
-    """Decoder of GNSS and IMU messages, live and offline.
-
-    Args:
-        antenna: (3,) m, body frame.
-        body_T_imu: (4, 4).
-        find: returns the pose (4, 4) of a frame on the body by `/tf_static`, which has priority; None if it is unknown.
-    """
-
-    def __init__(self, antenna: Array, body_T_imu: Array, find: Callable[[str], Array | None]) -> None:
-        self._antenna, self._body_T_imu, self._find = antenna, body_T_imu, find
-        self._gravity = GravityFilter()
-
-    def decode(self, source: Aid, message: Any, stamp_ns: int) -> AbsoluteMeasurement | None:
-        """Return the measurement in a message; None if an IMU has none yet.
-
-        Raises:
-            MessageError: the message cannot be used.
-        """
-        mounted = self._find(message.header.frame_id)
-        if source is Aid.GNSS:
-            return decode_fix(message, stamp_ns, self._antenna if mounted is None else mounted[:3, 3])
-        pose = self._body_T_imu if mounted is None else mounted
-        return self._gravity.take(message, stamp_ns, pose[:3, :3])
+        return mean / size, float(_ATTITUDE_SIGMA)
 
 
 def parse_numbers(text: str, count: int, what: str) -> Array | None:

@@ -11,11 +11,11 @@ at the start of the odometry; `worlds` has its pose.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
@@ -39,6 +39,7 @@ from umf_ros.core.odometry_noise import OdometryNoise
 if TYPE_CHECKING:  # the pose graph lies above
     from umf_ros.pose_graph.odometry import OdometryChain
     from umf_ros.pose_graph.sessions import Sessions
+    from umf_ros.pose_graph.solver import Graph
 
 # standard deviations (m, rad) of the first pose in the world: free, fixed, of a start pose
 _FREE, _FIXED, _START_M, _START_RAD = 1e3, 1e-6, 5.0, np.deg2rad(5.0)
@@ -53,14 +54,6 @@ _ROUNDS, _TEST_ROUNDS = 1, 5
 _FIRST_FIXES = 5
 
 Factors = Sequence[tuple[int, Callable[[int], gtsam.NonlinearFactor]]]
-
-
-class Held(NamedTuple):
-    """A graph in the world: poses (N, 4, 4), factors of vertices, and noise of the anchors that are not fixed."""
-
-    poses: Array
-    absolute: Factors
-    loose: Mapping[int, gtsam.noiseModel.Base]
 
 
 @dataclass
@@ -201,30 +194,22 @@ class AbsoluteReference:
         return np.unique(np.array(stamps, np.int64))
 
     def solve(
-        self,
-        points: NDArray[np.void],
-        anchors: Sequence[int],
-        poses: Array,
-        components: list[int],
-        optimum: Callable[[Held], Array],
+        self, points: NDArray[np.void], graph: Graph, components: list[int], optimum: Callable[[Graph], Array]
     ) -> Array:
         """Return (N, 4, 4) poses of a graph's vertices with all accepted measurements, in the frames of its components.
 
         Args:
             points: (N,) odometry at the vertices.
-            anchors: fixed vertices, the first one of each component.
-            poses: (N, 4, 4) initial values.
+            graph: its anchors are the first vertices of the components.
             components: the earliest session of each session's component.
             optimum: solves the graph.
 
         Raises:
             GraphError: it cannot be solved.
         """
-        of = np.array(components, np.int64)[points["session"]]
-        rows = dict(
-            zip(zip(points["session"].tolist(), points["stamp"].tolist(), strict=True), range(len(points)), strict=True)
-        )
-        firsts = {int(of[row]): row for row in anchors if int(of[row]) in self.worlds}
+        of, poses = np.array(components, np.int64)[points["session"]], graph.poses
+        rows = {vertex: row for row, vertex in enumerate(graph.vertices)}
+        firsts = {int(of[row]): row for row in graph.anchors if int(of[row]) in self.worlds}
         held, factors, planes, loose = poses.copy(), list[Any](), list[tuple[list[int], bool]](), dict[int, Any]()
         for component, first in firsts.items():
             tracks = [one for one in self._tracks.items() if components[one[0][0]] == component and one[1].factors]
@@ -238,10 +223,10 @@ class AbsoluteReference:
                 held[of == component] = self.worlds[component] @ held[of == component]
                 loose[first] = _first_pose_noise(held[first], sources)
         if not loose:
-            return optimum(Held(poses, (), {}))
+            return optimum(graph)
         for _ in range(self._rounds if planes else 1):
             ground = [one for under, is_free in planes for one in self._planes(held, under, is_free)]
-            held = optimum(Held(held, factors + ground, loose))
+            held = optimum(replace(graph, poses=held, absolute=factors + ground, loose=loose))
         for component, first in firsts.items():
             if first in loose:
                 # products of many rotations lose their orthonormality

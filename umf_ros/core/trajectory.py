@@ -131,7 +131,7 @@ def write_geojson(path: Path, trajectories: Mapping[str, Array], world_T_map: Ar
 
 
 EDGE = np.dtype([("first", "i8"), ("second", "i8"), ("pose", "f8", (4, 4)), ("covariance", "f8", (6, 6))])
-"""Fields of an array of edges; see `Edge`."""
+"""Fields of an array of edges: pose `first_T_second`, covariance in GTSAM's order, tangent space of `second`."""
 _ROTATION_LAST = np.array([3, 4, 5, 0, 1, 2])
 
 

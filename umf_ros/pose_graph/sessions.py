@@ -129,8 +129,7 @@ class Sessions:
 
     def _optimum(self, points: PathPoints, graph: Graph, components: list[int], rough: bool = False) -> Array:
         """Return (N, 4, 4) poses at the minimum, absolute measurements included."""
-        solve, given = self._solver.solve, (points, graph.anchors, graph.poses, components)
-        poses = self.reference.solve(*given, lambda held: solve(replace(graph, **held._asdict()), rough))
+        poses = self.reference.solve(points, graph, components, lambda held: self._solver.solve(held, rough))
         self.cost = self._solver.cost
         return poses
 

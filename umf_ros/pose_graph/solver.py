@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -23,26 +23,10 @@ _SMALL, _ROUGH = 1e-3, 0.1
 _FEW_VERTICES = 300
 
 
-class Edge(NamedTuple):
-    """A relative measurement between two vertices.
-
-    Attributes:
-        first: the vertex the pose is measured in.
-        second: the measured vertex.
-        pose: (4, 4) `first_T_second`.
-        covariance: (6, 6) in GTSAM's order, tangent space of `second`.
-    """
-
-    first: int
-    second: int
-    pose: Array
-    covariance: Array
-
-
-def between(edge: Edge) -> gtsam.BetweenFactorPose3:
-    """Return the GTSAM factor of an edge."""
-    noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (edge.covariance + edge.covariance.T))
-    return gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.pose), noise)
+def between(first: int, second: int, pose: Array, covariance: Array) -> gtsam.BetweenFactorPose3:
+    """Return the factor of a (4, 4) `first_T_second` and its (6, 6) covariance in the tangent space of `second`."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (covariance + covariance.T))
+    return gtsam.BetweenFactorPose3(first, second, gtsam.Pose3(pose), noise)
 
 
 @dataclass(frozen=True)
@@ -134,7 +118,7 @@ class GraphSolver:
         if known is not None:
             return known
         first, second, pose, covariance = graph.edges[row]
-        return between(Edge(numbers[first], numbers[second], pose, covariance))
+        return between(numbers[first], numbers[second], pose, covariance)
 
 
 def _ordering(factors: gtsam.NonlinearFactorGraph, anchors: list[int], numbers: list[int]) -> gtsam.Ordering:

@@ -13,9 +13,8 @@ from umf_ros.core.errors import GraphError, OutputError, UmfError
 from umf_ros.core.geometry import relative
 from umf_ros.core.trajectory import write_g2o
 from umf_ros.lab.commands.graph import MOST_ROWS, app
-from umf_ros.lab.datasets.g2o import read_g2o
+from umf_ros.lab.datasets.g2o import Edge, read_g2o
 from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops, with_wrong_closures
-from umf_ros.pose_graph.solver import Edge
 
 RIGHT = closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0)
 

@@ -22,10 +22,9 @@ from graph_worlds import (
 from umf_ros.core.errors import GraphError, OutputError
 from umf_ros.core.geometry import adjoint, expmap, heading, invert, propagate
 from umf_ros.core.trajectory import write_g2o
-from umf_ros.lab.datasets.g2o import G2oGraph, as_recording, drive, read_g2o, write_plane
+from umf_ros.lab.datasets.g2o import Edge, G2oGraph, as_recording, drive, read_g2o, write_plane
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
-from umf_ros.pose_graph.solver import Edge
 
 
 def edges(count: int, planar: bool) -> list[Edge]:

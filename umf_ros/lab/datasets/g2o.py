@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,7 +33,6 @@ from umf_ros.core.geometry import (
 from umf_ros.core.trajectory import EDGE, g2o_lines, write_g2o
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import check_covariance, verdict_table
-from umf_ros.pose_graph.solver import Edge
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,6 +43,22 @@ _MOST_SOLUTIONS = 150
 _IGNORED = ("FIX", "PARAMS_", "VERTEX_XY", "VERTEX_TRACKXYZ", "EDGE_SE2_XY", "EDGE_SE3_TRACKXYZ")
 _IN_PLANE = np.array([3, 4, 2])
 _SWAP = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
+
+
+class Edge(NamedTuple):
+    """A relative measurement between two vertices.
+
+    Attributes:
+        first: the vertex the pose is measured in.
+        second: the measured vertex.
+        pose: (4, 4) `first_T_second`.
+        covariance: (6, 6) in GTSAM's order, tangent space of `second`.
+    """
+
+    first: int
+    second: int
+    pose: Array
+    covariance: Array
 
 
 @dataclass
