@@ -10,8 +10,10 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.frames import Embedding, Keyframe
 from umf_ros.core.geometry import Array, invert, make_pose, relative, rotation_angle, transform
 from umf_ros.lab.simulation.scenes import CAMERA
-from umf_ros.submaps.lookalikes import Lookalikes, common_keypoints, find_keypoints, guess_poses
 from umf_ros.verification import constants as const
+from umf_ros.verification.keypoints import Lookalikes, common_keypoints, find_keypoints
+from umf_ros.verification.pose_search import lifted
+from umf_ros.verification.prepared_scan import PreparedScan
 
 SIDE = 104
 LEVEL = np.zeros((SIDE, SIDE), np.float32)
@@ -73,9 +75,10 @@ def test_keypoints_lie_where_the_relief_is() -> None:
 def test_the_right_submap_is_found_among_others_and_only_if_admissible() -> None:
     lookalikes = Lookalikes()
     for seed in range(12):
-        lookalikes.add(100 + seed, submap(relief(seed)))
+        lookalikes.add(100 + seed, find_keypoints(relief(seed)))
     assert lookalikes.rows == list(range(100, 112))
-    query, everything = submap(relief(7), 160, 1.5, 1.5), np.arange(100, 112)
+    query = PreparedScan.of(submap(relief(7), 160, 1.5, 1.5)).keypoints
+    everything = np.arange(100, 112)
     assert lookalikes.search(query, everything)[0] == 107
     assert 107 not in lookalikes.search(query, everything[everything != 107])
     assert lookalikes.search(query, np.empty(0, np.intp)) == []
@@ -83,17 +86,17 @@ def test_the_right_submap_is_found_among_others_and_only_if_admissible() -> None
 
 def test_ground_on_which_nothing_stands_out_is_like_none() -> None:
     lookalikes, both = Lookalikes(), np.array([3, 8])
-    lookalikes.add(3, submap(LEVEL))
-    assert lookalikes.search(submap(relief(1)), both[:1]) == []
-    lookalikes.add(8, submap(relief(1)))
-    assert lookalikes.search(submap(LEVEL), both) == []
-    assert lookalikes.search(submap(relief(1)), both) == [8]
+    lookalikes.add(3, find_keypoints(LEVEL))
+    assert lookalikes.search(find_keypoints(relief(1)), both[:1]) == []
+    lookalikes.add(8, find_keypoints(relief(1)))
+    assert lookalikes.search(find_keypoints(LEVEL), both) == []
+    assert lookalikes.search(find_keypoints(relief(1)), both) == [8]
 
 
 def test_keypoints_give_the_pose_of_a_submap() -> None:
-    match, query, other = submap(relief(1)), submap(relief(1), 160, 3.0, 1.5), submap(LEVEL)
-    guess = guess_poses(query, [match])[match.stamp_ns]
+    match, query, other = map(PreparedScan.of, (submap(relief(1)), submap(relief(1), 160, 3.0, 1.5), submap(LEVEL)))
+    count, turn, shift = common_keypoints(query.keypoints, match.keypoints)
     true = invert(make_pose(Rotation.from_euler("z", -160, degrees=True).as_matrix(), [-3.0, -1.5, 0.0]))
-    error = relative(true, guess)
-    assert np.linalg.norm(error[:3, 3]) < 0.5 and rotation_angle(error) < 0.05
-    assert guess_poses(query, [other]) == guess_poses(query, []) == {}
+    error = relative(true, lifted(match, query, turn, shift))
+    assert count and np.linalg.norm(error[:3, 3]) < 0.5 and rotation_angle(error) < 0.05
+    assert common_keypoints(query.keypoints, other.keypoints)[0] == 0

@@ -9,7 +9,7 @@ from submaps_drives import Drive
 
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, make_pose, relative
-from umf_ros.submaps.merging import DriftMeter
+from umf_ros.submaps.history import DriftMeter
 
 
 def drifting(outing: Drive, scale: float, turn_deg_m: float, count: int = 20) -> list[Keyframe]:

@@ -15,10 +15,9 @@ from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import known_only
-from umf_ros.verification.passages import locate_along, passage_direction
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import align_scans
-from umf_ros.verification.scan_consistency import ambiguity, compare_scans
+from umf_ros.verification.scan_consistency import ambiguity, compare_scans, locate_along, passage_direction
 
 ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
 AZIMUTHS = np.radians(np.arange(0.0, 360.0, 0.4))

@@ -13,10 +13,9 @@ from umf_ros.core.geometry import Array, make_pose, near, relative, rotation_ang
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan
 from umf_ros.verification import Hypothesis
 from umf_ros.verification.constants import DISTINCT_M, DISTINCT_RAD
-from umf_ros.verification.pose_search import find_hypotheses
+from umf_ros.verification.pose_search import RotatedMaps, find_hypotheses
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.rerank import rerank
-from umf_ros.verification.yaw_search import RotatedMaps
 
 GROUND = landscape(20)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)

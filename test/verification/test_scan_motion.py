@@ -8,16 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.frames import Embedding, Keyframe, ScanMotion, StereoCamera
+from umf_ros.core.frames import Candidate, Embedding, Keyframe, ScanMotion, StereoCamera
 from umf_ros.core.geometry import Array, make_pose
 from umf_ros.runs.truth import normalised_errors, pose_error
-from umf_ros.verification.scan_alignment import (
-    Alignment,
-    CovarianceModel,
-    covariance_of,
-    motion_covariance,
-    scan_covariance,
-)
+from umf_ros.verification import Hypothesis
+from umf_ros.verification.measurement import closure_covariance
+from umf_ros.verification.scan_alignment import Alignment, CovarianceModel, covariance_of, motion_covariance
 
 MODEL = CovarianceModel(4.0, 0.001, 0.005, unknown_motion_m=0.04, unknown_motion_deg=0.1)
 COUNT = 600
@@ -83,7 +79,9 @@ def test_motion_that_was_not_removed_is_unknown() -> None:
     still = keyframe(ScanMotion.none(COUNT))
     for pair in ((still, keyframe(None)), (keyframe(None), still)):
         np.testing.assert_array_equal(motion_covariance(*pair, alignment, MODEL), MODEL.unknown_motion)
-    added = scan_covariance(still, keyframe(None), alignment, MODEL) - covariance_of(alignment.information, MODEL)
+    candidate = Candidate(0, still.stamp_ns, 0.5)
+    hypothesis = Hypothesis.of(keyframe(None), candidate, still, pose=TRUE, alignment=alignment)
+    added = closure_covariance(hypothesis, MODEL) - covariance_of(alignment.information, MODEL)
     np.testing.assert_allclose(added, MODEL.unknown_motion, atol=1e-12)
 
 

@@ -13,9 +13,7 @@ from umf_ros.core.config import Settings
 from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, invert, near, relative
 from umf_ros.fleet.link import Answer, FleetLink
-from umf_ros.submaps.history import SubmapHistory, can_be_merged
-from umf_ros.submaps.lookalikes import guess_poses
-from umf_ros.submaps.merging import submap_around
+from umf_ros.submaps.history import SubmapHistory, can_be_merged, submap_around
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
 
@@ -169,8 +167,7 @@ class InterRobotMatcher:
             return []
         around = [one for one in answer.around or () if can_be_merged(one)]
         theirs, expected = submap_around(match, around) or match, consensus.expect(query, match)
-        guesses = guess_poses(query, [theirs]) if expected is None else {match.stamp_ns: expected}
-        return verifier.verify(query, [(candidate, theirs)], guesses)
+        return verifier.verify(query, [(candidate, theirs)], {} if expected is None else {match.stamp_ns: expected})
 
     def finish(self, timeout_s: float) -> Iterator[InterRobotClosure]:
         """Finish all pushes and queries within a time limit, and verify all answers."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -11,11 +11,11 @@ from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, relative
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps.history import SubmapHistory
-from umf_ros.submaps.lookalikes import Lookalikes, guess_poses
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
-
-NO_GUESSES: dict[int, Array] = {}
+from umf_ros.verification.keypoints import Lookalikes
+from umf_ros.verification.prepared_scan import PreparedScan
+from umf_ros.verification.verifier import NO_GUESSES
 
 
 class SubmapFinder:
@@ -82,7 +82,7 @@ class SubmapFinder:
         return compared + [one for one in verdicts if one.candidate.stamp_ns not in known]
 
     def compare(
-        self, query: Keyframe, candidates: Sequence[Candidate], guesses: dict[int, Array] = NO_GUESSES
+        self, query: Keyframe, candidates: Sequence[Candidate], guesses: Mapping[int, Array] = NO_GUESSES
     ) -> list[Hypothesis]:
         """One verdict for each candidate whose submap can be compared with that of a keyframe.
 
@@ -101,7 +101,6 @@ class SubmapFinder:
         submap = self.history.before(query, first_m) if pairs else None
         if submap is None:
             return []
-        guesses = guess_poses(submap, [match for _, match in pairs if match.stamp_ns not in guesses]) | guesses
         return self._verifier.verify(submap, pairs, guesses)
 
     def remember(self, keyframe: Keyframe, described: int = 1) -> None:
@@ -124,7 +123,7 @@ class SubmapFinder:
         rows += [self._stored.pop() for _ in range(min(stored, len(self._stored)))]
         for row in rows:
             if (submap := self.history.around(row)) is not None:
-                self._lookalikes.add(row, submap)
+                self._lookalikes.add(row, PreparedScan.of(submap).keypoints)
 
     def _note_closures(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> bool:
         """Whether there are closures; odometry carries the last of them on to the next keyframes."""
@@ -212,4 +211,4 @@ class SubmapFinder:
         # scans that both submaps hold are alike for no other reason
         first_m = query.path_length_m - 2 * const.ODOMETRY_REACH_M
         apart = (keys["session"] != query.session) | (keys["travelled_m"] < first_m)
-        return self._lookalikes.search(submap, rows[apart])[: const.LOOKALIKES]
+        return self._lookalikes.search(self._verifier.scans[submap].keypoints, rows[apart])[: const.LOOKALIKES]

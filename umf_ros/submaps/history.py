@@ -1,17 +1,167 @@
-"""Past keyframes along the path, and the submaps of what was seen there."""
+"""Submaps: scans of the metres around a keyframe, merged where its own scan shows too little of the place."""
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import OrderedDict, deque
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.frames import Keyframe
-from umf_ros.core.geometry import Array
+from umf_ros.core.frames import Keyframe, ScanMotion
+from umf_ros.core.geometry import Array, cubes, heading, relative, transform
 from umf_ros.places.store import KeyframeStore
-from umf_ros.submaps.merging import DriftMeter, drift_along, needed_scans, submap_of
 from umf_ros.verification import constants as const
+from umf_ros.verification.prepared_scan import PreparedScan
+from umf_ros.verification.scan_alignment import align_scans
+
+
+def submap_of(keyframe: Keyframe, others: Sequence[Keyframe], drift: DriftMeter) -> Keyframe | None:
+    """The keyframe with the scans merged that it needs, as if they were one scan; None where it needs or may have none.
+
+    Args:
+        keyframe: its own scan stays as it is.
+        others: of the same session, the nearest along the path first.
+        drift: of the odometry.
+    """
+    reach_m = _reach_m(keyframe)
+    needed = [
+        one for one in needed_scans(keyframe, others) if drift.blur(_way_m(keyframe, one), reach_m) < const.MAX_BLUR_M
+    ]
+    return _merged(keyframe, needed, drift) if needed else None
+
+
+def needed_scans(keyframe: Keyframe, others: Sequence[Keyframe]) -> Sequence[Keyframe]:
+    """The first of the others that together show most of what all do nearby; none where the keyframe's own does.
+
+    A sensor that is sparse at the distances of the structure, or sees little of what is around, needs many.
+    """
+    reach_m = _reach_m(keyframe)
+    cell_m = float(np.clip(reach_m / const.REACH_CELLS, *const.MAP_CELL_M))
+    seen, counts = np.empty(0, np.int64), []
+    for one in (keyframe, *others):
+        points = moved_to(keyframe, one)
+        near = points[np.einsum("ij,ij->i", points, points) < reach_m**2]
+        seen = np.union1d(seen, cubes(near, cell_m))
+        counts.append(len(seen))
+    shares = np.array(counts) / max(counts[-1], 1)
+    return [] if shares[0] >= const.ENOUGH_SEEN else others[: int(np.argmax(shares >= const.MOST_SEEN))]
+
+
+def moved_to(keyframe: Keyframe, other: Keyframe) -> Array:
+    """Points (N, 3) of another keyframe of the session in the body frame of this one, by odometry, m."""
+    return transform(_body_T_other(keyframe, other), other.points.astype(float))
+
+
+def _merged(keyframe: Keyframe, others: Sequence[Keyframe], drift: DriftMeter) -> Keyframe:
+    """The keyframe with the points of others where it has none; of those in a cube, of the nearest along the path."""
+    scans = [keyframe, *others]
+    points = np.concatenate([moved_to(keyframe, one) for one in scans])
+    owner = np.repeat(np.arange(len(scans)), [len(one.points) for one in scans])
+    inside = (owner == 0) | (np.einsum("ij,ij->i", points, points) < const.MAX_RANGE_M**2)
+    points, owner = points[inside], owner[inside]
+    cell_m, chosen = const.THIN_CELL_M, _first_of_cubes(points, const.THIN_CELL_M)
+    while len(chosen) > const.MERGED_POINTS and len(chosen) > len(keyframe.points):
+        cell_m *= max(float(np.sqrt(len(chosen) / const.MERGED_POINTS)), 1.05)
+        chosen = _first_of_cubes(points, cell_m)
+        chosen = np.concatenate([np.arange(len(keyframe.points)), chosen[owner[chosen] > 0]])
+    taken = sorted(set(owner[chosen].tolist()), key=lambda number: scans[number].stamp_ns)
+    seconds = np.array([1e-9 * (one.stamp_ns - keyframe.stamp_ns) for one in scans], np.float32)
+    way_m, lasted_s = max(_way_m(keyframe, one) for one in scans), max(float(np.abs(seconds).max()), 1e-3)
+    motion = ScanMotion(
+        seconds[owner[chosen]],
+        np.zeros(6),
+        drift.variance(way_m) / lasted_s,
+        removed=keyframe.motion is not None,
+        body_T_lidars=np.stack([_body_T_other(keyframe, scans[i]) @ scans[i].body_T_lidar for i in taken]),
+    )
+    return replace(keyframe, points=points[chosen].astype(np.float32), motion=motion)
+
+
+def _first_of_cubes(points: Array, cell_m: float) -> NDArray[np.intp]:
+    """Indices of the first of (N, 3) points in every occupied cube of this side, in order."""
+    return np.sort(np.unique(cubes(points, cell_m), return_index=True)[1])
+
+
+def _body_T_other(keyframe: Keyframe, other: Keyframe) -> Array:
+    if keyframe.odom_T_body is None or other.odom_T_body is None:
+        raise ValueError("scans are merged by odometry")
+    return relative(keyframe.odom_T_body, other.odom_T_body)
+
+
+def _way_m(keyframe: Keyframe, other: Keyframe) -> float:
+    return abs(keyframe.path_length_m - other.path_length_m)
+
+
+def _reach_m(keyframe: Keyframe) -> float:
+    """Median distance of the points, m."""
+    return float(np.median(np.linalg.norm(keyframe.points, axis=1)))
+
+
+def submap_around(keyframe: Keyframe, others: Sequence[Keyframe]) -> Keyframe | None:
+    """The keyframe merged with those around it on its path, by the drift that they themselves show; as `submap_of`."""
+    others = sorted(others, key=lambda one: _way_m(keyframe, one))
+    if not needed_scans(keyframe, others):
+        return None
+    return submap_of(keyframe, others, drift_along(sorted([keyframe, *others], key=lambda one: one.path_length_m)))
+
+
+def drift_along(path: Sequence[Keyframe]) -> DriftMeter:
+    """The drift of odometry on the second half of a path, where there are scans before."""
+    drift = DriftMeter()
+    for number in range(len(path) // 2, len(path)):
+        keyframe = path[number]
+        before = [one for one in path[number - 1 :: -1] if _way_m(keyframe, one) <= const.ODOMETRY_REACH_M]
+        if number and needed_scans(keyframe, before):
+            drift.add(keyframe, before)
+    return drift
+
+
+class DriftMeter:
+    """Compares scans with those before them, as odometry joins them, over the latest tens of metres.
+
+    A submap is no better than the odometry that joined it, and a wheel that slips in proportion to the path is nothing
+    that its noise would show. Against all scans before it even a sparse scan can be aligned.
+    """
+
+    def __init__(self) -> None:
+        self._gaps: deque[Array] = deque(maxlen=const.DRIFT_STEPS)
+
+    def add(self, keyframe: Keyframe, before: Sequence[Keyframe]) -> None:
+        """Compare a scan with those before it, newest first."""
+        points = np.concatenate([moved_to(before[0], one) for one in before[::-1]])
+        ways_m = np.concatenate([np.full(len(one.points), _way_m(keyframe, one)) for one in before[::-1]])
+        oldest = _first_of_cubes(points, const.TERRAIN_CELL_M)
+        match = PreparedScan(points[oldest].astype(np.float32))
+        query = PreparedScan.of(keyframe)
+        if not (match.usable and query.usable):
+            return
+        moved = _body_T_other(before[0], keyframe)
+        aligned = align_scans(match, query, moved)
+        if aligned.overlap >= const.ENOUGH_SEEN:
+            gap = relative(moved, aligned.pose)
+            way_m = float(ways_m[oldest[aligned.pairs[:, 1]]].mean())
+            self._gaps.append(np.array([*gap[:3, 3], heading(gap), way_m]))
+
+    def variance(self, way_m: float) -> Array:
+        """Variances (6,) x y z rx ry rz that odometry gains on a path, m^2 and rad^2; infinite if unknown."""
+        if len(self._gaps) < const.DRIFT_KNOWN:
+            return np.full(6, np.inf)
+        gaps = np.array(self._gaps)
+        ways = gaps[:, 4:]
+        # what every metre adds alike, and what metres add by chance
+        bias = np.median(gaps[:, :4] / ways, axis=0)
+        chance = 1.4826 * np.median(np.abs(gaps[:, :4] - bias * ways) / np.sqrt(ways), axis=0)
+        # the estimate of the bias errs too: by more, the shorter the path it was measured on
+        variance = (bias * way_m) ** 2 + chance**2 * way_m * (1 + way_m / ways.sum())
+        return np.append(variance, variance[[3, 3]])
+
+    def blur(self, way_m: float, reach_m: float) -> float:
+        """How far a point at a distance lies beside its place after a path, standard deviation, m."""
+        variance = self.variance(way_m)
+        return float(np.sqrt(variance[:2].sum() + variance[5] * reach_m**2))
+
 
 Rows = NDArray[np.intp]
 

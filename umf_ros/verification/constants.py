@@ -96,18 +96,15 @@ MIN_RUNNER_UP = 0.1  # measured: of right poses 2 in 100 have a rival as near as
 # passages: corridors, tunnels, aisles, canyons, where a scan looks the same all along
 PLANE_REACH_M = 0.8  # by hand: wider neighbourhoods are no surface
 PLANE_WIDTH_M, PLANE_ROUNDNESS = 0.1, 0.45  # by hand: narrower neighbourhoods lie on a single ring
-PLANE_THICKNESS_M = 0.04  # by hand: twice the noise of a range
-PLANE_SIGMA_M = 0.04  # measured: .1 m tells right poses from wrong ones less well
+PLANE_SIGMA_M = 0.04  # measured: twice the noise of a range; .1 m tells right poses from wrong ones less well
 # measured: of normals along to normals across; nine in ten scans of passages have up to .37, a real street from .38
 PASSAGE_RATIO = 0.38
 PASSAGE_SURFACE = 0.1  # measured: share of points on planes; woods and orchards have less, passages from .2
 PASSAGE_COMMON = 0.25  # by hand: of the compared points that a rival needs
 PASSAGE_SHIFTS_M = np.arange(-15.0, 15.1, 0.25)  # geometry: as far as scans overlap
-PASSAGE_SAMPLE = 750  # by hand: points of a half that are compared with the other scan
 PASSAGE_RIVALS = 16  # by hand: of these poses, that are aligned
-PASSAGE_APART_M = (
-    0.5  # measured: between these; without a distance, the right pose is not among the rivals of a wrong one
-)
+# measured: between these; without a distance, the right pose is not among the rivals of a wrong one
+PASSAGE_APART_M = 0.5
 # measured on validation passages: log of the ratio of misfits, and standard deviations, the larger near the identity
 PASSAGE_LEAD, PASSAGE_SIGMAS, PATTERN_M, PATTERN_SIGMAS = 0.12, 1.6, 1.3, 2.4
 
@@ -134,10 +131,8 @@ PROMISING = 0.05  # by hand: probability of a scan's hypothesis from which on su
 DRIFT_KNOWN, DRIFT_STEPS = 3, 24  # by hand: scans that the drift of odometry is judged by, at least and at most
 ODOMETRY_ALONE_M = 80.0  # by hand: path over which odometry without a closure is worth a look
 DESCRIBED_EVERY = 2  # of the keyframes that are merged; by hand: bounds the time
-LOOKALIKES, SUBMAPS_COMPARED = (
-    2,
-    10,
-)  # that get a pose; measured: of the most voted for, where four of five right ones are
+# submaps that get a pose; measured: of the most voted for, where four of five right ones are
+LOOKALIKES, SUBMAPS_COMPARED = 2, 10
 KEYPOINTS, KEYPOINT_CONTRAST = 120, 0.01  # measured: 80 and .02 find less
 MIN_KEYPOINTS = 4  # by hand: two of them make a motion, and two more confirm it
 KEYPOINT_SCALE = 0.1  # by hand: odometry that is off by a tenth is useless

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure, Points
-from umf_ros.core.geometry import Array
+from umf_ros.core.geometry import Array, near
+from umf_ros.verification import constants as const
 
 if TYPE_CHECKING:
     from umf_ros.verification.prepared_scan import PreparedScan
@@ -51,7 +52,8 @@ class Hypothesis:
     Attributes:
         query_stamp_ns: key of the query keyframe.
         candidate: the candidate.
-        measurements: results of the tests by name (`measurement.MEASUREMENTS`); of the candidate alone without a pose.
+        measurements: results of the tests by name (`MEASUREMENTS` of `umf_ros/lab/fit/acceptance.py`); of the candidate
+            alone without a pose.
         reason: why it is no closure; None before the decision and when accepted.
         detail: figures for `reason`.
         probability: that the pose is right; None without a pose.
@@ -120,6 +122,11 @@ class Hypothesis:
     def reject(self, reason: RejectReason, detail: str = "") -> None:
         """Set the reason why this is no closure."""
         self.reason, self.detail, self.closure = reason, detail, None
+
+
+def same_pose(a: Array, b: Array) -> bool:
+    """Return whether an alignment that begins at either of two poses (4, 4) ends at the same."""
+    return near(a, b, const.DISTINCT_M, const.DISTINCT_RAD)
 
 
 def measurements_of(candidate: Candidate) -> dict[str, float]:

@@ -1,7 +1,8 @@
 """Measurements of an aligned hypothesis: the numbers that the decision is made from.
 
-A new test is three steps: a number in one of the functions below with its meaning in `MEASUREMENTS`, a `Criterion` in
-`acceptance` with the values that speak for a closure, and a fit (`umf_ros/lab/fit/`), which gives it its weight.
+A new test is three steps: a number in one of the functions below with its meaning in `MEASUREMENTS` of
+`umf_ros/lab/fit/acceptance.py`, a `Criterion` in `acceptance` with the values that speak for a closure, and a fit
+(`umf_ros/lab/fit/`), which gives it its weight.
 """
 
 from __future__ import annotations
@@ -11,56 +12,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from umf_ros.core.geometry import Array, make_pose, near
+from umf_ros.core.geometry import Array, make_pose
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import terrain_fit
-from umf_ros.verification.hypothesis import IMAGE, Hypothesis, known_only
+from umf_ros.verification.hypothesis import IMAGE, Hypothesis, known_only, same_pose
 from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled
 from umf_ros.verification.scan_alignment import (
+    NOMINAL,
     Alignment,
     CovarianceModel,
     covariance_of,
-    nominal_deviations,
-    scan_covariance,
+    motion_covariance,
 )
 from umf_ros.verification.scan_consistency import compare_scans
 from umf_ros.verification.view_alignment import ViewAlignment
-
-MEASUREMENTS = {
-    "similarity": "cosine similarity of the global descriptors",
-    "inliers_image": "pairs of image features that one homography explains",
-    "inliers_cloud": "pairs of the scan's features that one rigid motion explains",
-    "superfeatures": "eligible pairs of super-features, where the reranking goes by them",
-    "residual_m": "median point-to-plane distance of the scans; of views, median distance of paired points",
-    "residual_p90_m": "nine of ten points are nearer than this to their counterpart's plane",
-    "noise_m": "how far the match's points scatter about their own planes",
-    "overlap": "share of the points seen by both that have a counterpart; of views, share of the pairs that agree",
-    "points": "points that have a counterpart",
-    "merged": "scans behind the larger of two submaps; 1 where two single scans were aligned",
-    "terrain_correlation": "correlation of the relief of both scans, -1 to 1",
-    "terrain_score": "the same in standard deviations of chance",
-    "terrain_rival": "the correlation at the best of some poses beside this one, of submaps of narrow sensors",
-    "relief_m": "standard deviation of the relief on the ground that both scans saw",
-    "common": "share of a scan's points that the other should see, the smaller of both ways, as all that follow",
-    "contradiction": "share of these that the other's rays passed by, the larger of both",
-    "counterparts": "share of these that have a counterpart",
-    "upright_counterparts": "of walls, trunks and rocks that should be seen, the share with a counterpart",
-    "unexplained": "of the same, the share that is far from everything, the larger of both",
-    "rival_near": "logarithm of how much worse the points fit half a metre on; unknown for improbable hypotheses",
-    "rival_far": "the same of the best fit 1 to 6 m on; 0 when another pose fits as well",
-    "passage_lead": "how much worse the surfaces fit elsewhere along a passage; a closure needs 1",
-    "runner_up": "logarithm of how much more is missing at the next best hypothesis about the pair",
-    "pose_inliers": "feature pairs that agree with the pose",
-    "residual_sigmas": "errors of reprojection in standard deviations of the features' noise",
-    "spread": "of the pairs across the image: smaller deviation of column and row, as a share of width and height",
-    "disparity_bias_px": "estimated bias of all disparities; positive where stereo measures too little",
-    "two_way_m": "distance of the poses that the query's depths and the match's give by themselves",
-    "position_std_m": "standard deviation of the position along its least known direction, from the residuals",
-    "heading_std_deg": "of the heading",
-    "prior_sigmas": "distance from what odometry predicts, in standard deviations of its drift",
-    "support": "earlier keyframes, of the last few, that found a pose which odometry carries over to this one",
-}
-"""Name and meaning of every measurement, as in `candidates.csv` and on `~/candidates`."""
 
 
 def measure(hypothesis: Hypothesis) -> dict[str, float]:
@@ -71,14 +36,16 @@ def measure(hypothesis: Hypothesis) -> dict[str, float]:
         found = _measure_views(alignment)
     else:
         found = _measure_scans(alignment, *hypothesis.scans)
-    position_std_m, heading_std_deg = nominal_deviations(alignment.information)
-    return known_only(found | {"position_std_m": position_std_m, "heading_std_deg": heading_std_deg})
+    covariance = covariance_of(alignment.information, NOMINAL)
+    found["position_std_m"] = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    found["heading_std_deg"] = float(np.degrees(np.sqrt(covariance[5, 5])))
+    return known_only(found)
 
 
 def runner_up(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> dict[str, float]:
     """Return the lead of a hypothesis over others about the same candidate that end elsewhere, in what is missing."""
     pose = hypothesis.pose
-    distinct = [_missing(one) for one in others if not near(pose, one.pose, const.DISTINCT_M, const.DISTINCT_RAD)]
+    distinct = [_missing(one) for one in others if not same_pose(pose, one.pose)]
     if hypothesis.kind == IMAGE or not distinct:
         return {}
     floor = const.MISFIT_FLOOR
@@ -94,10 +61,12 @@ def _missing(hypothesis: Hypothesis) -> float:
 def closure_covariance(hypothesis: Hypothesis, model: CovarianceModel) -> Array:
     """Covariance (6, 6) of the pose in ROS order, match axes, m^2 and rad^2."""
     query, match = hypothesis.keyframes
-    if isinstance(hypothesis.alignment, Alignment):
-        return scan_covariance(match, query, hypothesis.alignment, model)
-    assert hypothesis.alignment is not None
-    return covariance_of(hypothesis.alignment.information, model)
+    alignment = hypothesis.alignment
+    assert alignment is not None
+    if isinstance(alignment, ViewAlignment):
+        return covariance_of(alignment.information, model)
+    of_residuals = covariance_of(alignment.information, model, alignment.overlap)
+    return of_residuals + motion_covariance(match, query, alignment, model)
 
 
 def _measure_scans(alignment: Alignment, match: PreparedScan, query: PreparedScan) -> dict[str, float]:

@@ -1,21 +1,158 @@
-"""Poses for a candidate: from maps, from images where scans tell nothing, and from findings of earlier keyframes."""
+"""Poses for a candidate: from maps, from images where scans tell nothing, and from findings of earlier keyframes.
+
+Scans are searched whatever the heading. The query's map is turned to every heading at which the two can see the same
+things and is correlated with the match's over all shifts at once (FFT): its relief alone, and relief with structure; in
+the open the one is right, among walls the other. Every peak is refined by some steps of ICP on a few points, and ranked
+by how many of these then have a counterpart. It needs no training and does not depend on the light.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, Points
-from umf_ros.core.geometry import Array, near, relative
+from umf_ros.core.geometry import Array, heading, invert, make_pose, relative, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.hypothesis import Hypothesis
-from umf_ros.verification.prepared_scan import PreparedScan, views_decide
+from umf_ros.verification.grid_map import GridMap, Spectra, terrain_fit
+from umf_ros.verification.hypothesis import Hypothesis, same_pose
+from umf_ros.verification.keypoints import common_keypoints
+from umf_ros.verification.prepared_scan import PreparedScan, levelled, views_decide
+from umf_ros.verification.scan_alignment import run_gicp
 from umf_ros.verification.view_alignment import PairedViews
-from umf_ros.verification.yaw_search import Fit, RotatedMaps, coarse_align, search
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """One way two scans could lie on each other.
+
+    Attributes:
+        pose: (4, 4) `match_T_query`.
+        share: of some of the query's points, how many have a counterpart.
+        terrain: how well the relief fits there, in standard deviations of chance.
+        structured: whether enough stands around both to be compared, where terrain says nothing.
+    """
+
+    pose: Array
+    share: float
+    terrain: float
+    structured: bool
+
+    @property
+    def score(self) -> float:
+        """Rank of the fit: counterparts, and terrain where they say little."""
+        return self.share + const.TERRAIN_WEIGHT * self.terrain
+
+    @property
+    def telling(self) -> bool:
+        """Whether there is anything that could have spoken against it; two bare planes fit anywhere."""
+        return self.structured or self.terrain >= const.MIN_MAP_SCORE
+
+
+class RotatedMaps:
+    """Spectra of a query's map at every heading, each made when it is first asked for."""
+
+    def __init__(self, scan: PreparedScan) -> None:
+        self.scan = scan
+        self.map = scan.map(scan.cell_m)
+        self._spectra: dict[int, Spectra] = {}
+
+    def spectra(self, wanted: NDArray[np.intp]) -> Spectra:
+        """Spectra (H, 2, ...), conjugated, at the headings (H,) by index."""
+        fresh = [index for index in wanted.tolist() if index not in self._spectra]
+        if fresh:
+            made = self.map.turned_spectra(const.ALL_HEADINGS[fresh])
+            self._spectra |= dict(zip(fresh, made, strict=True))
+        return np.stack([self._spectra[index] for index in wanted.tolist()])
+
+
+def search(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
+    """The best fits, best first, each from a peak of its own."""
+    overlap = match.view.overlap(turned.scan.view, const.ALL_HEADINGS)
+    wanted = np.flatnonzero(overlap >= const.SEARCHED_OVERLAP)
+    theirs, ours = match.map(turned.map.cell_m), turned.map
+    if not len(wanted) or min(len(theirs.rows), len(ours.rows)) < const.FEWEST_POINTS:
+        return []
+    fits = []
+    for index, shift in _peaks(_correlate(theirs, turned.spectra(wanted)), wanted, const.PEAKS, ours.cell_m):
+        guess = lifted(match, turned.scan, float(const.ALL_HEADINGS[index]), shift)
+        fits.append(coarse_align(match, turned.scan, guess))
+    return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
+
+
+def coarse_align(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
+    """Refine a pose by a few points, and count how many of them find a counterpart."""
+    pose = _by_scouts(match, query, guess)
+    squared = match.nearest(transform(pose, query.scouts))[1]
+    near = squared < (const.SCOUT_NEAR * query.cell_m) ** 2
+    terrain = terrain_fit(match.terrain, query.terrain, levelled(match, query, pose))[1]
+    structured = all(scan.map(query.cell_m).structured for scan in (match, query))
+    return Fit(pose, float(near.mean()), terrain, structured)
+
+
+def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
+    """Where else the query could lie at the heading of a pose, refined: the peaks but that of the pose."""
+    level = levelled(match, query, pose)
+    theirs, ours, turn = match.map(query.cell_m), query.map(query.cell_m), float(heading(level))
+    volumes = _correlate(theirs, ours.turned_spectra(np.array([turn])))
+    row, column = np.round(level[:2, 3] / query.cell_m).astype(int) + const.MAP_SHIFT
+    volumes[:, :, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
+    peaks = _peaks(volumes, np.zeros(1, np.intp), const.PEAKS // 2, query.cell_m)
+    return [_by_scouts(match, query, lifted(match, query, turn, shift)) for _, shift in peaks]
+
+
+def _by_scouts(match: PreparedScan, query: PreparedScan, guess: Array) -> Array:
+    return run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M)
+
+
+def _correlate(around: GridMap, turned: Spectra) -> NDArray[np.float32]:
+    """Correlation (2, H, shifts, shifts) of the relief, and of relief and structure together."""
+    products = around.spectra * turned
+    products[:, 1] += products[:, 0]
+    window = np.arange(-const.MAP_SHIFT, const.MAP_SHIFT + 1)
+    rows = scipy.fft.ifft(products, axis=-2)[..., window, :]
+    found: NDArray[np.float32] = scipy.fft.irfft(rows, around.side, axis=-1)[..., window].swapaxes(0, 1)
+    return found
+
+
+def _peaks(
+    volumes: NDArray[np.float32], headings: NDArray[np.intp], count: int, cell_m: float
+) -> list[tuple[int, Array]]:
+    """Heading and shift (2,) m of the highest peaks of each volume, so many of each, no two of them neighbours."""
+    peaks: list[tuple[int, Array]] = []
+    every = np.full((len(const.ALL_HEADINGS), *volumes.shape[2:]), -np.inf, np.float32)
+    taken = np.zeros(every.shape, bool)
+    for volume in volumes:
+        every[headings] = volume
+        for _ in range(count):
+            every[taken] = -np.inf
+            index, row, column = (int(i) for i in np.unravel_index(int(every.argmax()), every.shape))
+            if not every[index, row, column] > 0:
+                break
+            peaks.append((index, (np.array([row, column]) - const.MAP_SHIFT) * cell_m))
+            beside = np.arange(index - 1, index + 2) % len(every)
+            taken[beside, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = True
+    return peaks
+
+
+def lifted(match: PreparedScan, query: PreparedScan, turn: float, shift: Array) -> Array:
+    """`match_T_query` of a planar fit, rad and (2,) m between the upright frames, with the height of the ground."""
+    theirs, ours = match.map(query.cell_m), query.map(query.cell_m)
+    cos, sin = math.cos(turn), math.sin(turn)
+    planar = make_pose(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), [*shift, 0.0])
+    offset = theirs.look_up(theirs.lowest, transform(planar, ours.cells)) - ours.lowest[ours.rows, ours.columns]
+    known = offset[np.isfinite(offset)]
+    if len(known):
+        planar[2, 3] = np.median(known)
+    found: Array = invert(match.upright_T_body) @ planar @ query.upright_T_body
+    return found
 
 
 def find_hypotheses(
@@ -36,7 +173,7 @@ def find_hypotheses(
         turned: the query's map at every heading; None without a usable scan.
         match: the candidate's scan, usable or not.
         settings: RANSAC iterations and seed.
-        guess: `match_T_query` (4, 4) as odometry has it.
+        guess: `match_T_query` (4, 4) as odometry has it; without it the keypoints of submaps give one.
     """
     if turned is None or views_decide(match, turned.scan):
         views = paired_views(query, keyframe, settings)
@@ -46,11 +183,14 @@ def find_hypotheses(
         if turned is None or not match.usable or views is not None:
             return []
     fits = search(match, turned)
+    if guess is None and max(match.merged, turned.scan.merged) > 1:
+        count, turn, shift = common_keypoints(turned.scan.keypoints, match.keypoints)
+        guess = lifted(match, turned.scan, turn, shift) if count else None
     if guess is not None and (fit := coarse_align(match, turned.scan, guess)).telling:
         fits.insert(0, replace(fit, share=1.0))  # submaps that share little would not rank it first
     distinct: list[Fit] = []
     for fit in fits:
-        if not any(near(fit.pose, other.pose, const.DISTINCT_M, const.DISTINCT_RAD) for other in distinct):
+        if not any(same_pose(fit.pose, other.pose) for other in distinct):
             distinct.append(fit)
     return [Hypothesis.of(query, candidate, keyframe, pose=fit.pose, score=fit.score) for fit in distinct]
 
@@ -69,12 +209,8 @@ def paired_views(query: Keyframe, match: Keyframe, settings: Verification) -> Pa
     return PairedViews.of(query, match, const.VIEW_NOISE[settings.features])
 
 
-@dataclass(frozen=True, slots=True)
-class _Finding:
-    query: Keyframe
-    match: Keyframe
-    match_T_query: Array
-    accepted: bool
+_Finding = tuple[Keyframe, Keyframe, Array, bool]
+"""A query, its match, `match_T_query` and whether it was accepted."""
 
 
 class TemporalMemory:
@@ -89,7 +225,7 @@ class TemporalMemory:
 
     def remember(self, query: Keyframe, found: list[tuple[Keyframe, Array, bool]]) -> None:
         """Add what one keyframe found: matched keyframes, `match_T_query` and whether it was accepted."""
-        self._findings.append([_Finding(query, *finding) for finding in found])
+        self._findings.append([(query, *finding) for finding in found])
 
     def expected(
         self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]
@@ -101,22 +237,17 @@ class TemporalMemory:
 
     def _expected_distance(self, query: Keyframe, match: Keyframe) -> float:
         """Metres between a pair, as odometry carries it over from the latest accepted closure near it; or inf."""
-        for finding in (one for findings in reversed(self._findings) for one in findings if one.accepted):
-            carried = _carried(finding, query, match)
-            if carried is not None:
-                return float(np.linalg.norm(carried[:3, 3]))
-        return float("inf")
+        accepted = (one for findings in reversed(self._findings) for one in findings if one[3])
+        carried = (_carried(finding, query, match) for finding in accepted)
+        return next((float(np.linalg.norm(pose[:3, 3])) for pose in carried if pose is not None), float("inf"))
 
     def support(self, query: Keyframe, match: Keyframe, match_T_query: Array) -> float:
         """How many of the remembered earlier keyframes found a pose that odometry carries over to this one."""
-
-        def agrees(finding: _Finding) -> bool:
-            if finding.query.stamp_ns == query.stamp_ns:
-                return False
-            carried = _carried(finding, query, match)
-            return carried is not None and near(carried, match_T_query, const.DISTINCT_M, const.DISTINCT_RAD)
-
-        return float(sum(any(map(agrees, findings)) for findings in self._findings))
+        earlier = [[one for one in findings if one[0].stamp_ns != query.stamp_ns] for findings in self._findings]
+        carried = [[_carried(finding, query, match) for finding in findings] for findings in earlier]
+        return float(
+            sum(any(same_pose(pose, match_T_query) for pose in poses if pose is not None) for poses in carried)
+        )
 
 
 def prior_sigmas(query: Keyframe, match: Keyframe, match_T_query: Array, drift: float) -> float:
@@ -133,14 +264,11 @@ def prior_sigmas(query: Keyframe, match: Keyframe, match_T_query: Array, drift: 
 
 def _carried(found: _Finding, query: Keyframe, match: Keyframe) -> Array | None:
     """`match_T_query` as odometry carries it over from an earlier finding; None where that is far or unknown."""
-    poses = (found.query.odom_T_body, query.odom_T_body, found.match.odom_T_body, match.odom_T_body)
-    query_before, query_now, match_before, match_now = poses
-    if query_before is None or query_now is None or match_before is None or match_now is None:
+    steps = []
+    for before, now in ((found[0], query), (found[1], match)):
+        if before.odom_T_body is None or now.odom_T_body is None or before.session != now.session:
+            return None
+        steps.append(relative(before.odom_T_body, now.odom_T_body))
+    if sum(float(np.linalg.norm(step[:3, 3])) for step in steps) > const.ODOMETRY_REACH_M:
         return None
-    if found.query.session != query.session or found.match.session != match.session:
-        return None
-    moved, shifted = relative(query_before, query_now), relative(match_before, match_now)
-    if float(np.linalg.norm(moved[:3, 3]) + np.linalg.norm(shifted[:3, 3])) > const.ODOMETRY_REACH_M:
-        return None
-    carried: Array = relative(shifted, found.match_T_query @ moved)
-    return carried
+    return relative(steps[1], found[2] @ steps[0])

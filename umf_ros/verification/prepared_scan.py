@@ -16,6 +16,7 @@ from umf_ros.core.geometry import Array, cubes, evenly, invert, make_pose, trans
 from umf_ros.core.levelling import upright
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import GridMap
+from umf_ros.verification.keypoints import Keypoints, find_keypoints
 from umf_ros.verification.visibility import FieldOfView, RangeImage
 
 Indices = NDArray[np.intp]
@@ -76,7 +77,7 @@ class Surfaces:
         variances, axes = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets / neighbours.shape[1])
         thickness, width, length = np.sqrt(np.maximum(variances, 0.0)).T
         reach = np.sqrt(np.asarray(squared)[:, -1])
-        even = (thickness < const.PLANE_THICKNESS_M) & (4 * thickness < width)
+        even = (thickness < const.PLANE_SIGMA_M) & (4 * thickness < width)
         wide = (width > const.PLANE_WIDTH_M) & (width > const.PLANE_ROUNDNESS * length)
         planar = even & wide & (reach < const.PLANE_REACH_M)
         return cls(points, tree, axes[:, :, 0], centres, reach, planar)
@@ -180,6 +181,11 @@ class PreparedScan:
     def terrain(self) -> GridMap:
         """Map of the relief out to 26 m, in cells in which rocks and ripples are seen at any range."""
         return GridMap(self.upright_points, const.TERRAIN_CELL_M, 2 * const.MAP_RADIUS)
+
+    @cached_property
+    def keypoints(self) -> Keypoints:
+        """Keypoints of this relief."""
+        return find_keypoints(self.terrain.relief)
 
     @cached_property
     def range_images(self) -> list[RangeImage]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -18,18 +18,8 @@ from umf_ros.core.geometry import Array, align, relative, transform
 from umf_ros.core.resources import find
 from umf_ros.verification import constants as const
 
-
-@dataclass(frozen=True, slots=True)
-class Consensus:
-    """A homography (3, 3) or a pose (4, 4) that takes one set to another, and the mask (N,) of pairs that agree."""
-
-    model: Array
-    inliers: NDArray[np.bool_]
-
-    @property
-    def count(self) -> int:
-        """How many pairs agree."""
-        return int(self.inliers.sum())
+Consensus = tuple[Array, NDArray[np.bool_]]
+"""A homography (3, 3) or a pose (4, 4) that takes one set to another, and the mask (N,) of pairs that agree."""
 
 
 def fit_homography(a: Array, b: Array, threshold: float, iterations: int, seed: int) -> Consensus | None:
@@ -47,7 +37,7 @@ def fit_homography(a: Array, b: Array, threshold: float, iterations: int, seed: 
     model, mask = cv2.findHomography(a, b, options)
     if model is None or not np.linalg.det(model) > 0 or mask.sum() < 4:
         return None
-    return Consensus(np.asarray(model, float), mask.ravel().astype(bool))
+    return np.asarray(model, float), mask.ravel().astype(bool)
 
 
 def fit_rigid(a: Array, b: Array, threshold: float, iterations: int, seed: int) -> Consensus | None:
@@ -80,7 +70,7 @@ def fit_rigid(a: Array, b: Array, threshold: float, iterations: int, seed: int) 
     if spread[1] < 1e-6 * spread[0] or pose[2, 2] < np.cos(const.MAX_TILT_RAD):  # a line leaves a turn open
         return None
     agrees = np.linalg.norm(transform(pose, a) - b, axis=1) < threshold
-    return Consensus(pose, agrees) if agrees.sum() >= 3 else None
+    return (pose, agrees) if agrees.sum() >= 3 else None
 
 
 Indices = NDArray[np.intp]
@@ -93,13 +83,21 @@ WITHOUT: dict[str, Any] = {
 """Features that a choice of modalities takes out of an embedding."""
 Offered = tuple[Candidate, Keyframe]
 """A candidate with its keyframe."""
+SUPER = ("super_image", "super_cloud")
+Counts = dict[str, int | None]
+"""Pairs that agree by feature type; None where a side has none."""
 
 
 def rerank(query: Keyframe, candidates: Sequence[Offered], settings: Verification) -> list[Offered]:
     """The candidates with their inliers and scores, best first; equals are ordered by similarity, then by age."""
     count = _by_superfeatures if settings.rerank == "superfeatures" else _by_ransac
     query = replace(query, embedding=replace(query.embedding, **WITHOUT[settings.modalities]))
-    ranked = [(count(query, candidate, keyframe, settings), keyframe) for candidate, keyframe in candidates]
+    ranked = []
+    for candidate, keyframe in candidates:
+        counts = count(query, keyframe, settings)
+        image, cloud, *both = (float(counts.get(name) or 0) for name in (settings.features, "cloud", *SUPER))
+        found = replace(candidate, inliers_image=image, inliers_cloud=cloud, superfeatures=sum(both))
+        ranked.append((replace(found, score=score(candidate.similarity, counts)), keyframe))
     return sorted(ranked, key=lambda item: (-item[0].score, -item[0].similarity, item[0].stamp_ns))
 
 
@@ -117,7 +115,7 @@ def log_ratio(count: Any, floor: float, onset: float, slope: float) -> Any:
     return floor + np.logaddexp(0.0, slope * (np.log1p(count) - np.log1p(onset)))
 
 
-def score(similarity: float, counts: dict[str, int | None]) -> float:
+def score(similarity: float, counts: Counts) -> float:
     """Log-likelihood ratio of a candidate: of its similarity and of each feature type; None, not seen, says nothing."""
     fitted = likelihoods()
     seen = (log_ratio(count, **fitted[name]) for name, count in counts.items() if count is not None)
@@ -136,11 +134,6 @@ def select(ranked: list[Offered], count: int) -> list[Offered]:
         if len(chosen) < count and not any(_same_place(item[1], other) for _, other in chosen):
             chosen.append(item)
     return chosen
-
-
-def strongest(features: LocalFeatures, count: int) -> LocalFeatures:
-    """The first `count` features: a bound on what their comparison costs."""
-    return LocalFeatures(*(getattr(features, one.name)[:count] for one in fields(features)))
 
 
 def similarities(query: NDArray[Any], match: NDArray[Any]) -> NDArray[np.float32]:
@@ -178,24 +171,19 @@ def eligible_superfeatures(
     return ids[nearest <= ratio**2 * second]
 
 
-def _by_superfeatures(query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification) -> Candidate:
-    counts: dict[str, int | None] = {}
-    for name in ("super_image", "super_cloud"):
-        ours, theirs = getattr(query.embedding, name), getattr(match.embedding, name)
-        counts[name] = len(eligible_superfeatures(ours, theirs)) if ours and theirs else None
-    eligible = float(sum(filter(None, counts.values())))
-    ratio = score(candidate.similarity, counts)
-    return replace(candidate, inliers_image=0.0, inliers_cloud=0.0, superfeatures=eligible, score=ratio)
+def _by_superfeatures(query: Keyframe, match: Keyframe, settings: Verification) -> Counts:
+    pairs = {name: (getattr(query.embedding, name), getattr(match.embedding, name)) for name in SUPER}
+    return {name: len(eligible_superfeatures(*pair)) if all(pair) else None for name, pair in pairs.items()}
 
 
-def _by_ransac(query: Keyframe, candidate: Candidate, match: Keyframe, settings: Verification) -> Candidate:
+def _by_ransac(query: Keyframe, match: Keyframe, settings: Verification) -> Counts:
     ours, theirs = query.embedding, match.embedding
     reach = const.IMAGE_THRESHOLD * query.camera.width
     image = _explain(ours.image, theirs.image, fit_homography, reach, settings)
-    cloud = _explain(ours.cloud, theirs.cloud, fit_rigid, const.POINT_THRESHOLD_M, settings)
-    ratio = score(candidate.similarity, {settings.features: image, "cloud": cloud})
-    found = replace(candidate, inliers_image=float(image or 0), inliers_cloud=float(cloud or 0))
-    return replace(found, superfeatures=0.0, score=ratio)
+    return {
+        settings.features: image,
+        "cloud": _explain(ours.cloud, theirs.cloud, fit_rigid, const.POINT_THRESHOLD_M, settings),
+    }
 
 
 def _explain(
@@ -204,11 +192,11 @@ def _explain(
     """How many mutual neighbours among the strongest features one model explains; None if a side has none."""
     if query is None or match is None or 0 in (len(query.positions), len(match.positions)):
         return None
-    query, match = strongest(query, settings.rerank_features), strongest(match, settings.rerank_features)
-    pairs = mutual_neighbours(similarities(query.descriptors, match.descriptors))
-    here, there = query.positions[pairs[:, 0]].astype(float), match.positions[pairs[:, 1]].astype(float)
-    found = fit(here, there, threshold, settings.ransac_iterations, settings.seed)
-    return found.count if found else 0
+    strongest = slice(settings.rerank_features)
+    here, there = mutual_neighbours(similarities(query.descriptors[strongest], match.descriptors[strongest])).T
+    points = query.positions[here].astype(float), match.positions[there].astype(float)
+    found = fit(*points, threshold, settings.ransac_iterations, settings.seed)
+    return int(found[1].sum()) if found else 0
 
 
 def _same_place(a: Keyframe, b: Keyframe) -> bool:

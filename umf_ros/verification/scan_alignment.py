@@ -147,22 +147,6 @@ def covariance_of(found: Array, model: CovarianceModel, overlap: float | Array =
     return (covariance + covariance.swapaxes(-1, -2)) / 2
 
 
-def nominal_deviations(found: Array) -> tuple[float, float]:
-    """Nominal standard deviations of the position along its least known direction, m, and of the heading, deg.
-
-    Args:
-        found: information (6, 6) of the residuals.
-    """
-    nominal = covariance_of(found, NOMINAL)
-    return float(np.sqrt(np.linalg.eigvalsh(nominal[:3, :3])[-1])), float(np.degrees(np.sqrt(nominal[5, 5])))
-
-
-def scan_covariance(match: Keyframe, query: Keyframe, alignment: Alignment, model: CovarianceModel) -> Array:
-    """Covariance (6, 6) of a pose in ROS order, match axes, m^2 and rad^2: of its residuals and of the motion."""
-    of_residuals = covariance_of(alignment.information, model, alignment.overlap)
-    return of_residuals + motion_covariance(match, query, alignment, model)
-
-
 def motion_covariance(match: Keyframe, query: Keyframe, alignment: Alignment, model: CovarianceModel) -> Array:
     """Covariance (6, 6) from the motion during the two scans; zero where no scans were aligned."""
     if not len(alignment.pairs):

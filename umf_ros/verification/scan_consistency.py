@@ -1,16 +1,25 @@
-"""Consistency of two scans at a pose, and its ambiguity: whether they fit as well elsewhere."""
+"""Consistency of two scans at a pose, and its ambiguity: whether they fit as well elsewhere.
+
+In a passage (a corridor, tunnel, aisle or street canyon) scans look much the same all along. The pattern of one sensor
+lies on its floor, walls and ceiling in the same way wherever it stands. Points of two scans therefore coincide at the
+identity pose although the places differ, and an alignment of points that begins near it stays there. In a passage all
+positions along it are therefore compared, and a point's distance is that to a plane of the other scan. Points of one
+half of a scan, every second band of elevations, are compared with planes of the other half alone: no ring meets itself.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.geometry import Array, invert, near, transform
+from umf_ros.core.geometry import Array, evenly, invert, near, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.prepared_scan import PreparedScan, common_blur
-from umf_ros.verification.scan_alignment import SEARCHED
+from umf_ros.verification.pose_search import alternatives
+from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur
+from umf_ros.verification.scan_alignment import SEARCHED, run_gicp
 from umf_ros.verification.visibility import Sight, visible
-from umf_ros.verification.yaw_search import alternatives
 
 Mask = NDArray[np.bool_]
 
@@ -31,26 +40,21 @@ def compare_scans(match: PreparedScan, query: PreparedScan, pose: Array) -> dict
     distances = np.sqrt(squared), np.sqrt(query.nearest(back)[1])
     reaches = counterpart_reach(query.spacing, blur_m), counterpart_reach(match.spacing, blur_m)
     stands = _upright(match, index), _upright(match, match.picks)
-    both = []
+    ways = []
     for sight, distance, reach, upright in zip(sights, distances, reaches, stands, strict=True):
         seen = visible(sight)
-        both.append(
-            (
-                -float(seen.mean()) if len(seen) else 0.0,
-                _share(sight == Sight.PASSED, seen, 1.0),
-                -_share(distance < reach, seen, 0.0),
-                -_share(distance < reach, seen & upright, np.nan),
-                _share(distance > const.UNEXPLAINED * reach, seen & upright, np.nan),
-            )
+        ways.append(
+            {
+                "common": float(seen.mean()) if len(seen) else 0.0,
+                "contradiction": _share(sight == Sight.PASSED, seen, 1.0),
+                "counterparts": _share(distance < reach, seen, 0.0),
+                "upright_counterparts": _share(distance < reach, seen & upright, np.nan),
+                "unexplained": _share(distance > const.UNEXPLAINED * reach, seen & upright, np.nan),
+            }
         )
-    common, contradiction, counterparts, upright_counterparts, unexplained = np.fmax(*np.array(both)).tolist()
-    return {
-        "common": -common,
-        "contradiction": contradiction,
-        "counterparts": -counterparts,
-        "upright_counterparts": -upright_counterparts,
-        "unexplained": unexplained,
-    }
+    ours, theirs = ways
+    worse = {name: np.fmax if name in ("contradiction", "unexplained") else np.fmin for name in ours}
+    return {name: float(worse[name](ours[name], theirs[name])) for name in ours}
 
 
 def counterpart_reach(spacing: Array, blur_m: float) -> Array:
@@ -75,7 +79,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     - `rival_near`: half a metre on, along the direction in which the position is known least;
     - `rival_far`: at the best pose 1 to 6 m on, and at the other peaks of the search at the same heading.
 
-    0 when another pose fits as well. In passages, where points follow the pattern of the sensor, see `passages`.
+    0 when another pose fits as well. In a passage, where points follow the sensor's pattern, `locate_along` decides.
 
     Args:
         match: the matched scan.
@@ -95,13 +99,24 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
 
 def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array:
     """(K,) mean misfit with a scan of the other's visible points at poses (K, 4, 4); the worst where few are."""
-    points = (other.scouts @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
+    points = at_poses(poses, other.scouts)
     reach = np.tile(counterpart_reach(other.spacing[:: const.SCOUT_EVERY], common_blur(scan, other)), len(poses))
     misfit = np.minimum(np.sqrt(scan.nearest(points)[1]) / reach, const.RIVAL_MISFIT)
     seen = visible(scan.look_at(points)).reshape(len(poses), -1)
-    count = seen.sum(axis=1)
-    mean = (misfit.reshape(seen.shape) * seen).sum(axis=1) / np.maximum(count, 1)
-    return np.where(count >= const.FEWEST_POINTS, mean, const.RIVAL_MISFIT)
+    return mean_misfits(misfit.reshape(seen.shape), seen, const.FEWEST_POINTS, const.RIVAL_MISFIT)
+
+
+def mean_misfits(misfits: Array, known: Mask, fewest: float, otherwise: float) -> Array:
+    """(K,) mean of the known ones of misfits (K, N); another value where fewer are known."""
+    count = known.sum(axis=1)
+    mean = (misfits * known).sum(axis=1) / np.maximum(count, 1)
+    return np.where(count >= fewest, mean, otherwise)
+
+
+def at_poses(poses: Array, points: Array) -> Array:
+    """(K * N, 3) points (N, 3), moved by each of the poses (K, 4, 4)."""
+    moved: Array = points @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
+    return moved.reshape(-1, 3)
 
 
 def shifted(pose: Array, way: Array, shifts: Array) -> Array:
@@ -109,3 +124,124 @@ def shifted(pose: Array, way: Array, shifts: Array) -> Array:
     poses = np.repeat(pose[None], len(shifts), axis=0)
     poses[:, :3, 3] += shifts[:, None] * way
     return poses
+
+
+Misfits = tuple[Array, NDArray[np.bool_]]
+"""(K, N) of points at poses, from 0 on a surface to 1 off all or in space seen empty; and whether they are known."""
+
+
+class PassagePosition(NamedTuple):
+    """The pose `match_T_query` (4, 4) at which two scans in a passage fit best.
+
+    The lead is how much worse they fit elsewhere along the passage, as a share of what a closure needs.
+    """
+
+    pose: Array
+    lead: float
+
+
+def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> PassagePosition | None:
+    """Return the pose along a passage at which the surfaces of two scans fit best; None where there is no passage.
+
+    Poses as far along as scans overlap are compared by some of the points, and the best are aligned. The best of these
+    leads another when the misfit of the other is larger, and larger at enough places along the passage: at one place,
+    a door that moved or a person explains it. Near the identity more is asked, for what is left of the pattern's
+    influence is there.
+
+    Args:
+        match: the matched scan.
+        query: the query's scan.
+        pose: (4, 4) `match_T_query`, a pose along the passage.
+    """
+    way, theirs = passage_direction(match), passage_direction(query)
+    if way is None and theirs is not None:
+        way = pose[:3, :3] @ theirs
+    if way is None:
+        return None
+    along = shifted(pose, way, const.PASSAGE_SHIFTS_M)
+    best = along[_peaks(_means(*_misfits(match, query, along, const.SCOUT_EVERY)))]
+    aligned = [run_gicp(match, query.sample_cloud, one, const.FINE_REACH_M) for one in best]
+    poses = np.stack([pose, *aligned, *best])  # alignments may all end at one pose
+    misfits, known = _misfits(match, query, poses)
+    means = _means(misfits, known)
+    first = int(np.argmin(means[: 1 + len(aligned)]))
+    elsewhere = np.abs((poses[:, :3, 3] - poses[first, :3, 3]) @ way) > const.PASSAGE_APART_M
+    both = known[elsewhere] & known[first]
+    worse = np.where(both, misfits[elsewhere] - misfits[first], 0.0)
+    points = [transform(poses[first], half) for half in _halves(query)] + _halves(match)
+    metre = np.floor(np.concatenate(points) @ way).astype(int)
+    sums = np.stack([np.bincount(metre - metre.min(), row) for row in worse])
+    sigmas = sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9)
+    near = np.linalg.norm(poses[first, :3, 3]) < const.PATTERN_M
+    needed = const.PATTERN_SIGMAS if near else const.PASSAGE_SIGMAS
+    ratios = (means[elsewhere] - means[first]) / const.PASSAGE_LEAD
+    return PassagePosition(poses[first], float(np.minimum(ratios, sigmas / needed).min()))
+
+
+def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Misfits:
+    """Misfits of one in so many points of both scans with surfaces of the other at poses (K, 4, 4) `match_T_query`."""
+    sigma_m = const.PLANE_SIGMA_M + 2 * common_blur(match, query)
+    parts = [
+        _misfits_with(scan, planes, points, at, sigma_m)
+        for scan, other, at in ((match, query, poses), (query, match, invert(poses)))
+        for planes, points in zip(scan.surfaces, _halves(other, every), strict=True)
+    ]
+    misfits, known = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
+    return misfits, known
+
+
+def _misfits_with(scan: PreparedScan, planes: Surfaces, points: Array, poses: Array, sigma_m: float) -> Misfits:
+    """Misfits of points (N, 3) with planes of a scan."""
+    moved = at_poses(poses, points)
+    found, squared = planes.tree.batch_nearest_neighbor_search(moved, num_threads=1)
+    index = np.asarray(found, np.intp)
+    away = np.einsum("ij,ij->i", moved - planes.centres[index], planes.normals[index])
+    sigmas = (away / sigma_m) ** 2
+    passed = scan.look_at(moved) == Sight.PASSED
+    close = planes.planar[index] & (np.asarray(squared) < planes.reach_m[index] ** 2)
+    shape = len(poses), len(points)
+    return np.where(passed, 1.0, sigmas / (1.0 + sigmas)).reshape(shape), (passed | close).reshape(shape)
+
+
+def _means(misfits: Array, known: NDArray[np.bool_]) -> Array:
+    """(K,) logarithm of the mean misfit of a pose; that of 1 where far fewer points than elsewhere are known."""
+    fewest = max(const.FEWEST_POINTS, const.PASSAGE_COMMON * known.sum(axis=1).max(initial=0))
+    return np.log(mean_misfits(misfits, known, fewest, 1.0) + const.MISFIT_FLOOR)
+
+
+def _peaks(means: Array) -> list[int]:
+    """The best of the shifts along a passage, apart from each other, by their mean misfits."""
+    picks: list[int] = []
+    for number in np.argsort(means).tolist():
+        apart = np.abs(const.PASSAGE_SHIFTS_M[picks] - const.PASSAGE_SHIFTS_M[number])
+        if len(picks) < const.PASSAGE_RIVALS and np.all(apart >= const.PASSAGE_APART_M):
+            picks.append(number)
+    return picks
+
+
+def passage_direction(scan: PreparedScan) -> Array | None:
+    """(3,) the horizontal direction of the passage that a scan was taken in; None where it shows none.
+
+    A place is a passage where surfaces across it outweigh those along it.
+    """
+    weights, _ = _across(scan, scan.normals[scan.picks])
+    if weights[0] > const.PASSAGE_RATIO * weights[1]:  # most places are none: their planes are never asked for
+        return None
+    flat = np.concatenate([planes.normals[planes.planar] for planes in scan.surfaces])
+    if len(flat) < const.PASSAGE_SURFACE * len(scan.points):
+        return None
+    _, ways = _across(scan, flat)
+    way: Array = scan.up.T @ np.append(ways[:, 0], 0.0)
+    return way
+
+
+def _across(scan: PreparedScan, normals: Array) -> tuple[Array, Array]:
+    """Weights (2,) and horizontal directions (2, 2) of normals (N, 3) of a scan, the least first."""
+    level = (normals @ scan.up.T)[:, :2]
+    weights, ways = np.linalg.eigh(level.T @ level)
+    return weights, ways
+
+
+def _halves(scan: PreparedScan, every: int = 1) -> list[Array]:
+    """Some points (N, 3) of each half of a scan, the half first whose bands the first planes lie between."""
+    return [half.points[evenly(len(half.points), const.SAMPLE // 2)[::every]] for half in reversed(scan.surfaces)]

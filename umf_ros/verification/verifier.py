@@ -11,18 +11,22 @@ import numpy as np
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Keyframe, LoopClosure
-from umf_ros.core.geometry import Array, heading, near
+from umf_ros.core.geometry import Array, heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
-from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of
+from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
-from umf_ros.verification.passages import locate_along
-from umf_ros.verification.pose_search import TemporalMemory, consistent_pixels, find_hypotheses, prior_sigmas
+from umf_ros.verification.pose_search import (
+    RotatedMaps,
+    TemporalMemory,
+    consistent_pixels,
+    find_hypotheses,
+    prior_sigmas,
+)
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans, inspect
-from umf_ros.verification.scan_consistency import ambiguity
-from umf_ros.verification.yaw_search import RotatedMaps
+from umf_ros.verification.scan_consistency import ambiguity, locate_along
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 
@@ -38,6 +42,10 @@ class Verifier:
     Args:
         settings: the verification group of the settings.
 
+    Attributes:
+        scans: the prepared scans, kept while they are used.
+        latency_ms: of the last call, by step.
+
     Raises:
         ConfigError: the acceptance model cannot be read.
     """
@@ -46,7 +54,7 @@ class Verifier:
         self._settings = settings
         self._acceptance = load_acceptance(settings.calibration)
         self._memory = TemporalMemory()
-        self._scans = ScanCache()
+        self.scans = ScanCache()
         self.latency_ms: dict[str, float] = {}
 
     def retune(self, settings: Verification) -> None:
@@ -56,11 +64,11 @@ class Verifier:
     def reset(self) -> None:
         """Forget earlier keyframes, as after a jump of the clock."""
         self._memory.reset()
-        self._scans.clear()
+        self.scans.clear()
 
     def prefetch(self, keyframe: Keyframe) -> None:
         """Prepare the scan of a keyframe that is verified next; it need not be embedded yet."""
-        self._scans[keyframe].make_ready()
+        self.scans[keyframe].make_ready()
 
     def verify(
         self, query: Keyframe, candidates: Sequence[Offered], guesses: Mapping[int, Array] = NO_GUESSES
@@ -83,10 +91,7 @@ class Verifier:
             others = [one for one in select(ranked, self._settings.refine_best) if one[0].index not in expected]
             judged += self._refine(query, others, turned, guesses)
             chosen = chosen + others
-        least = self._settings.min_probability
-        self._memory.remember(
-            query, [(one.keyframes[1], one.pose, (one.probability or 0.0) >= least) for one in judged]
-        )
+        self._memory.remember(query, [(one.keyframes[1], one.pose, self._probable(one)) for one in judged])
         found = self._best(query, ranked, judged, {candidate.index for candidate, _ in chosen})
         compared = {candidate.index for candidate, _ in ranked}
         reason = RejectReason.NOT_COMPARED
@@ -122,7 +127,7 @@ class Verifier:
         self.latency_ms[name] += 1e3 * (time.perf_counter() - start)
 
     def _turned(self, query: Keyframe) -> RotatedMaps | None:
-        return RotatedMaps(self._scans[query]) if self._scans[query].usable else None
+        return RotatedMaps(self.scans[query]) if self.scans[query].usable else None
 
     def _hypotheses(
         self,
@@ -134,7 +139,7 @@ class Verifier:
         """Hypotheses about the given candidates, the most promising first."""
         found: list[Hypothesis] = []
         for candidate, keyframe in ranked:
-            scan, guess = self._scans[keyframe], guesses.get(keyframe.stamp_ns)
+            scan, guess = self.scans[keyframe], guesses.get(keyframe.stamp_ns)
             found += find_hypotheses(query, candidate, keyframe, turned, scan, self._settings, guess)
         return sorted(found, key=lambda one: -one.score)
 
@@ -182,7 +187,7 @@ class Verifier:
     def _probability(self, hypothesis: Hypothesis) -> float:
         """That a hypothesis is right; where scans show bare ground alone, nothing would refute a texture seen twice."""
         found = self._acceptance.probability(hypothesis.measurements)
-        scans = [self._scans[keyframe] for keyframe in hypothesis.keyframes]
+        scans = [self.scans[keyframe] for keyframe in hypothesis.keyframes]
         if hypothesis.scans or not all(scan.usable and scan.bare for scan in scans):
             return found
         if hypothesis.measurements["spread"] < const.BARE_SPREAD:
@@ -199,16 +204,16 @@ class Verifier:
         kept: list[Hypothesis] = []
         for one in hypotheses:
             ends = [other.pose for other in before + kept if other.candidate is one.candidate]
-            if not _ends_at(one, ends):
+            if not any(same_pose(one.pose, end) for end in ends):
                 self._align(one)
-                if not _ends_at(one, ends):
+                if not any(same_pose(one.pose, end) for end in ends):
                     self._measure(one)
                     kept.append(one)
         return kept
 
     def _align(self, hypothesis: Hypothesis) -> None:
         query, match = hypothesis.keyframes
-        scans = self._scans[match], self._scans[query]
+        scans = self.scans[match], self.scans[query]
         if hypothesis.views is not None:
             hypothesis.alignment = hypothesis.views.align(hypothesis.pose)
         else:
@@ -261,7 +266,3 @@ class Verifier:
         if 0 < self._settings.max_shift_m < shift_m:
             return RejectReason.TOO_FAR, f"{shift_m:.1f} m > {self._settings.max_shift_m:g}"
         return None
-
-
-def _ends_at(hypothesis: Hypothesis, poses: list[Array]) -> bool:
-    return any(near(hypothesis.pose, pose, const.DISTINCT_M, const.DISTINCT_RAD) for pose in poses)

@@ -12,8 +12,7 @@ from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 
 _SECTORS = len(const.ALL_HEADINGS)
-_COLUMNS = round(360.0 / const.SIGHT_DEG)
-_ROWS = _COLUMNS // 2
+_ROWS, _COLUMNS = round(180.0 / const.SIGHT_DEG), round(360.0 / const.SIGHT_DEG)
 
 
 class FieldOfView:

@@ -34,9 +34,7 @@ from umf_ros.lab.scan_files import (
 )
 from umf_ros.runs.run_file import pose_numbers
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.submaps.history import can_be_merged
-from umf_ros.submaps.lookalikes import guess_poses
-from umf_ros.submaps.merging import submap_around
+from umf_ros.submaps.history import can_be_merged, submap_around
 from umf_ros.verification import Hypothesis, Verifier
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance
@@ -155,7 +153,7 @@ class Comparer:
         merged = their_submap or their_scan, our_submap or our_scan
         submaps = (their_submap or our_submap) is not None and not _share_scans(match, query, *merged)
         if verdict.closure is None and submaps:
-            verdict = judge(self._verifier, *merged, submaps=True)
+            verdict = judge(self._verifier, *merged)
             elapsed_ms += sum(self._verifier.latency_ms.values())
         blind = verdict.closure is None and not any(keyframe.has_depth for keyframe in keyframes)
         reason = NO_DEPTH if blind else verdict.outcome
@@ -272,14 +270,13 @@ def _share_scans(match: PlaceView, query: PlaceView, theirs: Keyframe, ours: Key
     return abs(theirs.path_length_m - ours.path_length_m) < 2 * const.ODOMETRY_REACH_M
 
 
-def judge(verifier: Verifier, match: Keyframe, query: Keyframe, submaps: bool = False) -> Hypothesis:
+def judge(verifier: Verifier, match: Keyframe, query: Keyframe) -> Hypothesis:
     """Verify one pair of keyframes without odometry and without the support of earlier pairs.
 
     Args:
         verifier: its memory is cleared.
         match: the earlier one.
         query: the later one.
-        submaps: whether their keypoints give a first pose.
     """
     match, query = (
         replace(keyframe, stamp_ns=stamp_ns, odom_T_body=None, path_length_m=float("nan"), session=0)
@@ -287,8 +284,7 @@ def judge(verifier: Verifier, match: Keyframe, query: Keyframe, submaps: bool = 
     )
     verifier.reset()
     candidate = Candidate(0, match.stamp_ns, similarity_of(match, query))
-    guesses = guess_poses(query, [match]) if submaps else {}
-    return verifier.verify(query, [(candidate, match)], guesses)[0]
+    return verifier.verify(query, [(candidate, match)])[0]
 
 
 def similarity_of(match: Keyframe, query: Keyframe) -> float:

@@ -22,8 +22,7 @@ from umf_ros.lab.simulation.domains.passages import Passage
 from umf_ros.lab.simulation.domains.passages import drive as drive_passage
 from umf_ros.lab.simulation.domains.survey import FIRST, MOUNTS, OTHER_WAY, SAME_WAY
 from umf_ros.sensors.decode import Cloud
-from umf_ros.submaps.lookalikes import guess_poses
-from umf_ros.submaps.merging import DriftMeter, needed_scans, submap_of
+from umf_ros.submaps.history import DriftMeter, needed_scans, submap_of
 from umf_ros.verification import Verifier
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import thin_scan
@@ -231,8 +230,7 @@ def verified(verifier: Verifier, pair: ScanPair) -> tuple[LoopClosure | None, bo
         return closure, False
     verifier.reset()
     match = pair.match.around or pair.match.keyframe
-    guesses = guess_poses(pair.query.before, [match])
-    return verifier.verify(pair.query.before, [(candidate, match)], guesses)[0].closure, True
+    return verifier.verify(pair.query.before, [(candidate, match)])[0].closure, True
 
 
 def _distance(query: ScannedPlace, match: ScannedPlace) -> float:

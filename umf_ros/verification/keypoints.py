@@ -1,21 +1,17 @@
-"""Search for submaps that look alike from above, whatever the heading, and their pose: keypoints of their relief."""
+"""Keypoints of the relief of submaps: which submaps look alike from above, whatever the heading, and their pose."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
-from umf_ros.verification.grid_map import Grid
-from umf_ros.verification.prepared_scan import PreparedScan
-from umf_ros.verification.yaw_search import lifted
+from umf_ros.verification.rerank import mutual_neighbours
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +27,7 @@ class Keypoints:
     descriptors: NDArray[np.float32]
 
 
-def keypoints_of(submap: Keyframe) -> Keypoints:
-    """Keypoints of the relief of a submap."""
-    return find_keypoints(PreparedScan.of(submap).terrain.relief)
-
-
-def find_keypoints(relief: Grid) -> Keypoints:
+def find_keypoints(relief: NDArray[np.float32]) -> Keypoints:
     """Keypoints of a map (R, C) of relief, m, NaN where it is unknown, in cells of `TERRAIN_CELL_M`."""
     highest = const.MAX_RELIEF_CELLS * const.TERRAIN_CELL_M
     picture = np.clip(128 + 127 / highest * np.nan_to_num(relief), 0, 255).astype(np.uint8)
@@ -53,31 +44,18 @@ def find_keypoints(relief: Grid) -> Keypoints:
     return Keypoints(places.astype(np.float32), np.sqrt(share).astype(np.float32))
 
 
-def guess_poses(query: Keyframe, matches: Sequence[Keyframe]) -> dict[int, Array]:
-    """Poses `match_T_query` of submaps that share keypoints with that of the query, by the stamp of the match."""
-    ours, guesses = PreparedScan.of(query), {}
-    keypoints = find_keypoints(ours.terrain.relief)
-    for match in matches:
-        theirs = PreparedScan.of(match)
-        count, turn, shift = common_keypoints(keypoints, find_keypoints(theirs.terrain.relief))
-        if count:
-            guesses[match.stamp_ns] = lifted(theirs, ours, turn, shift)
-    return guesses
-
-
 def common_keypoints(query: Keypoints, match: Keypoints) -> tuple[int, float, Array]:
     """How many keypoints one planar motion takes from the query to the match, rad and (2,) m; 0 without a motion."""
     nothing = 0, 0.0, np.zeros(2)
     if min(len(query.places), len(match.places)) < const.MIN_KEYPOINTS:
         return nothing
-    similarity = query.descriptors @ match.descriptors.T
-    there = similarity.argmax(axis=1)
-    here = np.flatnonzero(similarity.argmax(axis=0)[there] == np.arange(len(there)))
+    here, there = mutual_neighbours(query.descriptors @ match.descriptors.T).T
     if len(here) < const.MIN_KEYPOINTS:
         return nothing
     cv2.setRNGSeed(0)
+    reach_m = 2 * const.TERRAIN_CELL_M
     motion, inliers = cv2.estimateAffinePartial2D(
-        query.places[here], match.places[there[here]], ransacReprojThreshold=2 * const.TERRAIN_CELL_M, maxIters=300
+        query.places[here], match.places[there], ransacReprojThreshold=reach_m, maxIters=300
     )
     if motion is None or abs(float(np.hypot(motion[0, 0], motion[1, 0])) - 1) > const.KEYPOINT_SCALE:
         return nothing
@@ -91,19 +69,14 @@ class Lookalikes:
         self.rows: list[int] = []
         self._submaps: list[Keypoints] = []
 
-    def add(self, row: int, submap: Keyframe) -> None:
+    def add(self, row: int, keypoints: Keypoints) -> None:
         """Add the submap of a row of the database."""
         self.rows.append(row)
-        self._submaps.append(keypoints_of(submap))
+        self._submaps.append(keypoints)
 
-    def search(self, submap: Keyframe, admissible: NDArray[np.intp]) -> list[int]:
-        """Rows whose submaps share most keypoints with one, best first.
-
-        Args:
-            submap: of the newest keyframe.
-            admissible: rows that may be returned.
-        """
-        query, allowed = keypoints_of(submap), np.flatnonzero(np.isin(self.rows, admissible))
+    def search(self, query: Keypoints, admissible: NDArray[np.intp]) -> list[int]:
+        """Rows, of those that may be returned, whose submaps share most keypoints with the query's, best first."""
+        allowed = np.flatnonzero(np.isin(self.rows, admissible))
         if len(query.places) < const.MIN_KEYPOINTS or not len(allowed):
             return []
         votes = self._votes(query, allowed)
