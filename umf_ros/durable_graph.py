@@ -40,15 +40,9 @@ _EVENTS = "SELECT kind, first_ns, second_ns, data FROM event ORDER BY id"
 
 
 def feed(graph: PoseGraph, inputs: Iterable[GraphInput], splitter: OdometrySessionSplitter | None = None) -> bool:
-    """Pass stored inputs to a graph whose newest session is empty; `resume` decides about the closures.
+    """Pass stored inputs to a graph whose newest session is empty; return whether there was odometry.
 
-    Args:
-        graph: to be filled.
-        inputs: in the order of arrival.
-        splitter: splits odometry into the graph's sessions; None: a new one.
-
-    Returns:
-        Whether there was odometry.
+    The splitter (None: a new one) splits odometry into the graph's sessions. `resume` decides about the closures.
     """
     splitter, begun = splitter or OdometrySessionSplitter(graph), False
     for item in inputs:
@@ -77,10 +71,8 @@ class DurableGraph:
     decided again. When the disk is full, the graph continues without its log, and `on_fault` is called with the error.
 
     Args:
-        settings: of the graph.
         path: of the log, opened when it exists; None: no log.
-        on_fault: takes the error when the log cannot be written.
-        make: returns an empty graph.
+        make: returns an empty graph; None: a pose graph.
 
     Attributes:
         graph: the graph.
@@ -123,7 +115,7 @@ class DurableGraph:
     def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
         """Add a closure; return every verdict that it caused or changed."""
         numbers = np.hstack([closure.match_T_query.ravel(), closure.covariance.ravel(), closure.probability])
-        self._log(CLOSURE, closure.match_stamp_ns, closure.query_stamp_ns, numbers)
+        self._log(CLOSURE, *closure.pair, numbers)
         return self._logged(self.graph.add_closure(closure))
 
     def decide_by_hand(self, match_ns: int, query_ns: int, state: State) -> list[ClosureVerdict]:
@@ -169,7 +161,7 @@ class DurableGraph:
     def closures(self, pair: tuple[int, int] | None = None) -> list[ClosureVerdict]:
         """Return the latest verdict of every closure, or of those between two keyframes."""
         found = self.graph.closures()
-        return found if pair is None else [verdict for verdict in found if _pair(verdict.closure) == pair]
+        return found if pair is None else [verdict for verdict in found if verdict.closure.pair == pair]
 
     def last_accepted(self) -> LoopClosure | None:
         """Return the accepted closure that arrived last."""
@@ -259,7 +251,7 @@ class DurableGraph:
         self._write(f"PRAGMA user_version = {self._mark}")
         found = self.graph.closures()
         self.recovered = len(found)
-        states = {_pair(v.closure): v.state for v in found}
+        states = {v.closure.pair: v.state for v in found}
         self.changed = sum(states.get(pair) != state for pair, (state, *_) in verdicts.items())
 
     def _inputs(self, events: Iterable[tuple[Any, ...]], decided: dict[tuple[int, int], State]) -> Iterator[GraphInput]:
@@ -283,10 +275,7 @@ class DurableGraph:
                 self.feed.interrupted()
 
     def _logged(self, verdicts: list[ClosureVerdict]) -> list[ClosureVerdict]:
-        rows = [
-            (v.closure.match_stamp_ns, v.closure.query_stamp_ns, v.state.value, v.reason, v.residual, v.residual_m)
-            for v in verdicts
-        ]
+        rows = [(*v.closure.pair, v.state.value, v.reason, v.residual, v.residual_m) for v in verdicts]
         if rows:
             self._write("INSERT OR REPLACE INTO verdict VALUES (?, ?, ?, ?, ?, ?)", *rows)
         return verdicts
@@ -303,10 +292,6 @@ class DurableGraph:
                 connection.executemany(statement, rows) if rows else connection.execute(statement)
         except OutputError as error:
             self._on_fault(error)
-
-
-def _pair(closure: LoopClosure) -> tuple[int, int]:
-    return closure.match_stamp_ns, closure.query_stamp_ns
 
 
 def _decision(state: str, reason: str, *numbers: float | None) -> Decision:

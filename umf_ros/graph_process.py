@@ -41,12 +41,7 @@ def start_graph(settings: Settings, journal: Path | None, on_fault: Callable[[Ou
     """Start a process with a `DurableGraph`, or one that localises in a fixed map, and return its proxy.
 
     The proxy has the methods of `DurableGraph` and no attributes. A call waits for its answer; other threads run
-    meanwhile.
-
-    Args:
-        settings: of the graph.
-        journal: path of the log; None: no log.
-        on_fault: takes the error when the log cannot be written.
+    meanwhile. `journal` is the path of the log (None: no log), `on_fault` takes the error when it cannot be written.
 
     Raises:
         UmfError: the graph cannot be made, or the log cannot be used.

@@ -97,9 +97,7 @@ class Localizer:
     the covariances of closure and odometry, and change its odds by the path length between them. The pose is that of
     the accepted hypothesis until another one is accepted, so a kidnapped rover is relocalised.
 
-    Args:
-        poses: of the map's keyframes, by the stamps that closures name as their match.
-        settings: of the odometry's noise, and the gate.
+    `poses` are those of the map's keyframes, by the stamps that closures name as their match.
 
     Attributes:
         relocalised: number of times that a hypothesis was accepted.

@@ -23,13 +23,7 @@ from numpy.typing import NDArray
 
 from umf_ros.absolute.consistency import STRETCH_M, MeasuredPath, Rows, Track, apply, turned
 from umf_ros.absolute.elevation import ElevationModel, load_elevation
-from umf_ros.absolute.measurement import (
-    AbsoluteMeasurement,
-    AbsoluteReason,
-    AbsoluteVerdict,
-    Aid,
-    parse_numbers,
-)
+from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteReason, AbsoluteVerdict, Aid, parse_numbers
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError
 from umf_ros.core.frames import State
@@ -202,7 +196,7 @@ class AbsoluteReference:
             points: (N,) odometry at the vertices.
             graph: its anchors are the first vertices of the components.
             components: the earliest session of each session's component.
-            optimum: solves the graph.
+            optimum: solves a graph.
 
         Raises:
             GraphError: it cannot be solved.

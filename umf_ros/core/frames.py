@@ -230,6 +230,11 @@ class LoopClosure:
         """Stamps in ns of query and match, which identify a closure of a run."""
         return self.query_stamp_ns, self.match_stamp_ns
 
+    @property
+    def pair(self) -> tuple[int, int]:
+        """Stamps in ns of match and query, as decisions by hand name a closure."""
+        return self.match_stamp_ns, self.query_stamp_ns
+
 
 @dataclass(frozen=True, slots=True)
 class GraphState:

@@ -54,10 +54,7 @@ class FleetConsensus:
     """Consensus between rovers: a closure is pending until one of another place agrees with it.
 
     Within one rover the pose graph rejects wrong closures. Two rovers have no common graph on board, so the loop
-    through two closures and both odometries has to close.
-
-    Args:
-        drift: odometry error per path length.
+    through two closures and both odometries has to close; `drift` is the odometry's error per path length.
     """
 
     def __init__(self, drift: float) -> None:
@@ -112,7 +109,6 @@ class InterRobotMatcher:
     Where the scans of a sparse or narrow sensor give no closure, the most probable candidate is compared as a submap.
 
     Args:
-        settings: all settings.
         submaps: of the rover's drive; their store has an outbox.
         identity: name of the embedder and its dimension.
 

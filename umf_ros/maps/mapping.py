@@ -108,11 +108,7 @@ def _is_recording(path: Path) -> bool:
 def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: OnFrame = lambda *_: None) -> None:
     """Replay one recording into a run folder, which replaces an earlier one.
 
-    Args:
-        recording: any that `umf replay` can read.
-        opening: options.
-        folder: becomes a run folder with `places.sqlite`, stamped by the recording's own clock.
-        on_frame: called for every frame.
+    The folder gets `places.sqlite`, stamped by the recording's own clock. `on_frame` is called for every frame.
     """
     bag = open_bag(recording)
     settings = opening.settings(bag)
@@ -151,14 +147,8 @@ def _track(folder: Path, settings: Settings) -> None:
 def track(keyframes: Iterable[Keyframe], settings: Verification) -> tuple[list[StoredOdometry], list[Keyframe]]:
     """Track a recording without odometry by closures between consecutive keyframes.
 
-    Two consecutive keyframes without a closure begin a new session, which other closures have to connect.
-
-    Args:
-        keyframes: of one recording, in order, without odometry.
-        settings: of the verification of closures.
-
-    Returns:
-        The poses, and the keyframes with `odom_T_body`, `path_length_m` and `session`, which counts from 0.
+    Two consecutive keyframes without a closure begin a new session, which other closures have to connect. Returns the
+    poses, and the keyframes with `odom_T_body`, `path_length_m` and `session`, which counts from 0.
     """
     odometry: list[StoredOdometry] = []
     tracked: list[Keyframe] = []
@@ -209,12 +199,8 @@ def add_places(
 ) -> MapSession:
     """Add places of a session to the map's store, on the map's clock; `map.json`, written last, makes them its own.
 
-    Args:
-        target: the map; the run folder of the session holds its odometry.
-        name: of the session.
-        known: its places, on its own clock.
-        identity: embedder of the places, and numbers per descriptor.
-        recording: its description.
+    The run folder of the session holds its odometry; the known places are on its own clock. `identity` is the embedder
+    of the places and the numbers per descriptor.
     """
     _discard_unfinished(target)
     with closing(PlaceDatabase(Database(path=str(target.places)), *identity)) as places:
@@ -304,12 +290,7 @@ def open_places(path: Path) -> PlaceDatabase:
 def grow(map_folder: Path, run: Path) -> tuple[MapSession | None, dict[str, Any]]:
     """Add what a rover saw in a run that localised, since the run was added last, and solve the map.
 
-    Args:
-        map_folder: the map.
-        run: run folder with the places that the rover saw; it may go on.
-
-    Returns:
-        The new session, None where there is nothing new, and the summary of the map.
+    The run may go on. Returns the new session, None where there is nothing new, and the summary of the map.
 
     Raises:
         UmfError: either is missing or damaged, or another process adds to the map.

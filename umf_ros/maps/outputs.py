@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from contextlib import closing
-from dataclasses import dataclass
 from math import isnan, nan
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from scipy.spatial import cKDTree
 
 from umf_ros.core.config import TerrainSettings
 from umf_ros.core.errors import UmfError, reading, writing
-from umf_ros.core.frames import Points
 from umf_ros.core.geometry import Array, cubes, evenly, invert, transform
 from umf_ros.core.io import atomic_write, write_atomically
 from umf_ros.core.trajectory import Trajectory, write_geojson, write_tum
@@ -37,7 +35,14 @@ VOXEL_M = 0.1
 Poses = dict[int, Array]
 _NEIGHBOURS_M, _FEWEST = 0.5, 12
 _MOST_PROBED = 20_000
-_RECORD = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("session", "u1")])
+CLOUD = np.dtype([("point", "<f4", 3), ("session", "u1")])
+"""Fields of the points of a map: position in the map frame, m, and number of the recording, modulo 256."""
+_HEADERS = {
+    ".ply": "ply\nformat binary_little_endian 1.0\nelement vertex {count}\nproperty float x\nproperty float y\n"
+    "property float z\nproperty uchar session\nend_header\n",
+    ".pcd": "VERSION 0.7\nFIELDS x y z session\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+    "WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n",
+}
 THICKNESS = ("before", "with_moving", "after")
 
 
@@ -159,37 +164,23 @@ def _write_report(folder: Path, summary: dict[str, Any]) -> None:
     write_atomically(folder / "report.html", page)
 
 
-@dataclass(frozen=True)
-class MapCloud:
-    """Points of a map.
+def thin(cloud: NDArray[np.void], voxel_m: float = VOXEL_M) -> NDArray[np.void]:
+    """Keep the first point of `CLOUD` in every voxel."""
+    return cloud[np.unique(cubes(cloud["point"].astype(float), voxel_m), return_index=True)[1]]
 
-    Attributes:
-        points: (N, 3) float32, m, map frame.
-        sessions: (N,) number of the recording of each point, modulo 256.
+
+def thickness(cloud: NDArray[np.void]) -> float:
+    """Return the median thickness in m of surfaces seen by at least two recordings; thinner means a crisper map.
+
+    The standard deviation across the plane through the neighbours within half a metre of points all over the map
+    [after the mean plane variance of Razlaw 2015]; NaN where no two recordings overlap.
     """
-
-    points: Points
-    sessions: NDArray[np.uint8]
-
-    def thinned(self, voxel_m: float = VOXEL_M) -> MapCloud:
-        """Keep the first point in every voxel."""
-        _, first = np.unique(cubes(self.points.astype(float), voxel_m), return_index=True)
-        return MapCloud(self.points[first], self.sessions[first])
-
-    def thickness(self) -> float:
-        """Return the median thickness in m of surfaces seen by at least two recordings; thinner means a crisper map.
-
-        The standard deviation across the plane through the neighbours within half a metre of points all over the map
-        [after the mean plane variance of Razlaw 2015]; NaN where no two recordings overlap.
-        """
-        tree = cKDTree(self.points)
-        rows = evenly(len(self.points), _MOST_PROBED)
-        found = []
-        for near in tree.query_ball_point(self.points[rows], _NEIGHBOURS_M) if len(rows) else []:
-            if len(near) >= _FEWEST and len(set(self.sessions[near].tolist())) > 1:
-                spread = np.cov(self.points[near].T.astype(float))
-                found.append(np.sqrt(max(np.linalg.eigvalsh(spread)[0], 0.0)))
-        return float(np.median(found)) if found else float("nan")
+    points, sessions = cloud["point"], cloud["session"]
+    rows, found = evenly(len(points), _MOST_PROBED), []
+    for near in cKDTree(points).query_ball_point(points[rows], _NEIGHBOURS_M) if len(rows) else []:
+        if len(near) >= _FEWEST and len(set(sessions[near].tolist())) > 1:
+            found.append(np.sqrt(max(np.linalg.eigvalsh(np.cov(points[near].T.astype(float)))[0], 0.0)))
+    return float(np.median(found)) if found else nan
 
 
 def gather(folder: MapFolder, poses: Poses) -> tuple[list[PlacedScan], NDArray[np.uint8]]:
@@ -205,11 +196,14 @@ def gather(folder: MapFolder, poses: Poses) -> tuple[list[PlacedScan], NDArray[n
     return scans, np.array(sessions, np.uint8)
 
 
-def merge(scans: list[PlacedScan], sessions: NDArray[np.uint8]) -> MapCloud:
-    """Return the points of scans, each with its session, in one cloud."""
+def merge(scans: list[PlacedScan], sessions: NDArray[np.uint8]) -> NDArray[np.void]:
+    """Return the points of scans, each with its session, in one cloud of `CLOUD`."""
     placed = [transform(pose, points[np.linalg.norm(points, axis=1) < REACH_M]) for points, _, pose in scans]
     count = [len(points) for points in placed]
-    return MapCloud(np.concatenate([np.empty((0, 3), np.float32), *placed]), np.repeat(sessions, count))
+    cloud = np.empty(sum(count), CLOUD)
+    cloud["point"] = np.concatenate([np.empty((0, 3), np.float32), *placed])
+    cloud["session"] = np.repeat(sessions, count)
+    return cloud
 
 
 def write_cloud(folder: MapFolder, joint: JointMap) -> dict[str, float]:
@@ -228,22 +222,21 @@ def write_cloud(folder: MapFolder, joint: JointMap) -> dict[str, float]:
     scans, sessions = gather(folder, solved)
     everything, voxels = merge(scans, sessions), VoxelMap(folder.settings.terrain.cell_m)
     voxels.add(scans)
-    static = voxels.are_static(everything.points.astype(float))
-    cloud = MapCloud(everything.points[static], everything.sessions[static])
-    thin = cloud.thinned()
-    write_ply(folder.path / "map.ply", thin)
-    write_pcd(folder.path / "map.pcd", thin)
+    cloud = everything[voxels.are_static(everything["point"].astype(float))]
+    thinned = thin(cloud)
+    write_points(folder.path / "map.ply", thinned)
+    write_points(folder.path / "map.pcd", thinned)
     path = np.concatenate([np.empty((0, 2)), *(one.poses[:, :2, 3] for one in joint.sessions)])
     if len(path):
         heights = HeightMap(path)
-        heights.add(cloud.points)
+        heights.add(cloud["point"])
         png = heights.png()
         if png is not None:
             with atomic_write(folder.path / "map.png") as part:
                 part.write_bytes(png)
     write_terrain(folder.path, voxels.points().astype(float), folder.settings.terrain, joint.world)
-    before = merge(*gather(folder, driven)).thinned().thickness()
-    return {"before": before, "with_moving": everything.thinned().thickness(), "after": thin.thickness()}
+    before = thickness(thin(merge(*gather(folder, driven))))
+    return {"before": before, "with_moving": thickness(thin(everything)), "after": thickness(thinned)}
 
 
 def export_terrain(folder: MapFolder, settings: TerrainSettings, out: Path) -> str:
@@ -261,28 +254,7 @@ def export_terrain(folder: MapFolder, settings: TerrainSettings, out: Path) -> s
     return write_terrain(out, voxels.points().astype(float), settings, placed)
 
 
-def write_ply(path: Path, cloud: MapCloud) -> None:
-    """Write a binary PLY file of x, y, z and session."""
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud.points)}\nproperty float x\n"
-        "property float y\nproperty float z\nproperty uchar session\nend_header\n"
-    )
-    _write(path, header, cloud)
-
-
-def write_pcd(path: Path, cloud: MapCloud) -> None:
-    """Write a binary PCD file of x, y, z and session."""
-    count = len(cloud.points)
-    header = (
-        "VERSION 0.7\nFIELDS x y z session\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 1\n"
-        f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n"
-    )
-    _write(path, header, cloud)
-
-
-def _write(path: Path, header: str, cloud: MapCloud) -> None:
-    records = np.empty(len(cloud.points), _RECORD)
-    records["x"], records["y"], records["z"] = cloud.points.T
-    records["session"] = cloud.sessions
+def write_points(path: Path, cloud: NDArray[np.void]) -> None:
+    """Write x, y, z and session of the points of `CLOUD` as a binary PLY or PCD file."""
     with atomic_write(path) as part:
-        part.write_bytes(header.encode("ascii") + records.tobytes())
+        part.write_bytes(_HEADERS[path.suffix].format(count=len(cloud)).encode("ascii") + cloud.tobytes())

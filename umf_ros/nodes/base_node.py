@@ -312,16 +312,20 @@ class BaseNode(LifecycleNode, ABC):
             self.create_subscription(TFMessage, TOPIC, self._guarded("transforms", transforms.add), STATIC_QOS)
         return BodyFrames(self._settings.frames, transforms, warn, PATIENCE_S, calibration)
 
+    def _answer(self, name: str, action: Callable[[Any], str], request: Any) -> tuple[bool, str]:
+        """Return the success and the text of a service; any fault is a failure."""
+        try:
+            return True, action(request)
+        except Exception as error:
+            if not isinstance(error, UmfError):
+                self._report_fault(error, name)
+            return False, str(error)
+
     def _offer(self, kind: type, name: str, action: Callable[[Any], str]) -> None:
-        """Offer a service that answers with the text of `action`; any fault is a failure."""
+        """Offer a service that answers with the text of `action`."""
 
         def answer(request: Any, response: Any) -> Any:
-            try:
-                response.success, response.message = True, action(request)
-            except Exception as error:
-                if not isinstance(error, UmfError):
-                    self._report_fault(error, name)
-                response.success, response.message = False, str(error)
+            response.success, response.message = self._answer(name, action, request)
             return response
 
         self.create_service(kind, name, answer)
@@ -332,13 +336,8 @@ class BaseNode(LifecycleNode, ABC):
         """Offer a service whose action a worker does when it is its turn: the executor goes on meanwhile."""
 
         def act(request: Any, answered: Future) -> None:
-            try:
-                with watchdog.task(name, watchdog.PATIENT_S):
-                    answered.set_result((True, action(request)))
-            except Exception as error:
-                if not isinstance(error, UmfError):
-                    self._report_fault(error, name)
-                answered.set_result((False, str(error)))
+            with watchdog.task(name, watchdog.PATIENT_S):
+                answered.set_result(self._answer(name, action, request))
 
         async def answer(request: Any, response: Any) -> Any:
             answered = Future()

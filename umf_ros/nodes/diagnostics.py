@@ -42,8 +42,6 @@ class InputWatch:
     """Watch of one input topic: counts its messages and explains their absence.
 
     Args:
-        node: gives access to the graph of topics.
-        name: of the input.
         topic: subscribed name, after remapping.
         kind: message class.
         rare: silence is no fault as long as there is a publisher.

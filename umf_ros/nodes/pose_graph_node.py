@@ -282,7 +282,7 @@ class PoseGraphNode(BaseNode):
         last = self._durable.last_accepted()
         if last is None:
             raise UmfError("no closure is accepted")
-        self._announce(self._durable.decide_by_hand(last.match_stamp_ns, last.query_stamp_ns, State.REJECTED))
+        self._announce(self._durable.decide_by_hand(*last.pair, State.REJECTED))
         return f"closure {_name(last)} revoked"
 
     def _decide_by_hand(self, request: AddDiagnostics.Request, state: State) -> str:

@@ -71,11 +71,8 @@ class PoseGraph:
     def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
         """Add an odometry message, in any order; drop a second one of a stamp. Return false if it is refused.
 
-        Args:
-            stamp_ns: its stamp.
-            odom_T_body: (4, 4) pose.
-            covariance: (6, 6) in ROS order of the motion since the previous message, axes of the
-                previous body; None: the settings' odometry model.
+        A covariance (6, 6), in ROS order, is that of the motion since the previous message, axes of the previous body;
+        without one, the settings' odometry model applies.
         """
         try:
             check_pose(odom_T_body)
@@ -118,9 +115,9 @@ class PoseGraph:
         """
         self._refresh()
         held, self._held = self._held + self._take_waiting()[1], []
-        times, decided, new = Counter(_endpoints(placed.closure) for placed in held), [], []
+        times, decided, new = Counter(placed.closure.pair for placed in held), [], []
         for placed in held:
-            pair = _endpoints(placed.closure)
+            pair = placed.closure.pair
             decision = verdicts.get(pair) if times[pair] == 1 else None
             if decision is None or decision[0] is State.REFUSED or decision[1] is ClosureReason.NO_ODOMETRY_YET:
                 new.append(placed)
@@ -192,7 +189,7 @@ class PoseGraph:
     def _reprocess(self, within_s: float, is_ready: Callable[[PlacedClosure], bool] = lambda _: True) -> bool:
         """Decide again, from the odometry alone, by the stamps of query and match; return false if out of time."""
         until_s = time.monotonic() + within_s
-        order = sorted(self._rejection.placed, key=lambda placed: _endpoints(placed.closure)[::-1])
+        order = sorted(self._rejection.placed, key=lambda placed: placed.closure.pair[::-1])
         begun, sessions, rejection = self._ordered or (None, self._sessions, self._rejection)
         late = any(a is not b for a, b in zip_longest(rejection.placed, order[: len(rejection.placed)]))
         if late or begun != self._sessions.begun:
@@ -228,7 +225,7 @@ class PoseGraph:
         Raises:
             GraphError: there is no such closure, or the graph cannot be solved so; then nothing has changed.
         """
-        pairs = [_endpoints(placed.closure) for placed in self._rejection.placed]
+        pairs = [placed.closure.pair for placed in self._rejection.placed]
         rows = [row for row, pair in enumerate(pairs) if pair == (match_stamp_ns, query_stamp_ns)]
         self._settled = False
         if not rows:
@@ -261,14 +258,14 @@ class PoseGraph:
             match = self._sessions.find(closure.match_stamp_ns, before=query)
             if query is not None and match is not None:
                 # two measurements of one pair are two closures; an equal one is a repeated latched message
-                key = match, query, *_endpoints(closure), closure.match_T_query.tobytes()
+                key = match, query, *closure.pair, closure.match_T_query.tobytes()
                 if key in self._placed:
                     self.counts["closure twice"] += 1
                     continue
                 self._placed.add(key)
                 self._settled = False
                 arrived.append(PlacedClosure(match, query, closure))
-            elif waited_s > self._settings.max_gap_s and oldest_ns is not None and min(_endpoints(closure)) < oldest_ns:
+            elif waited_s > self._settings.max_gap_s and oldest_ns is not None and min(closure.pair) < oldest_ns:
                 refused.append(self._refuse(closure, ClosureReason.BEFORE_ODOMETRY))
             elif waited_s > self._settings.max_pending_s:
                 refused.append(self._refuse(closure, ClosureReason.NO_ODOMETRY))
@@ -411,7 +408,3 @@ class PoseGraph:
         self.write_tum(folder / "trajectory_optimized.tum")
         self.write_g2o(folder / "graph.g2o")
         return settled
-
-
-def _endpoints(closure: LoopClosure) -> tuple[int, int]:
-    return closure.match_stamp_ns, closure.query_stamp_ns

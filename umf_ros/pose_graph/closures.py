@@ -97,8 +97,7 @@ def verdict_table(verdicts: Iterable[ClosureVerdict]) -> str:
     writer.writerow(VERDICT_COLUMNS)
     for verdict in verdicts:
         numbers = (f"{verdict.residual:.3f}", f"{verdict.residual_m:.3f}")
-        endpoints = verdict.closure.match_stamp_ns, verdict.closure.query_stamp_ns
-        writer.writerow([*endpoints, verdict.state.value, verdict.reason, *numbers])
+        writer.writerow([*verdict.closure.pair, verdict.state.value, verdict.reason, *numbers])
     return text.getvalue()
 
 

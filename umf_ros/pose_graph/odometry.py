@@ -42,11 +42,7 @@ def noise_between(a: PathPoints, b: PathPoints) -> Array:
 
 
 class Table:
-    """Named columns that grow at their end in amortised constant time, and can be cut back.
-
-    Args:
-        columns: (0, ...) arrays of the type of each column.
-    """
+    """Named columns, given as (0, ...) arrays, that grow in amortised constant time and can be cut back."""
 
     def __init__(self, **columns: NDArray[Any]) -> None:
         self._columns = columns

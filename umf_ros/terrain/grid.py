@@ -151,10 +151,8 @@ def write_grid(folder: Path, grid: TerrainGrid) -> None:
 def write_elevation(path: Path, grid: TerrainGrid, origin: Array | None = None) -> None:
     """Write the heights of a grid as a GeoTIFF, north up.
 
-    Args:
-        path: the file.
-        grid: in axes east, north and up of the origin; in any axes without one.
-        origin: (3,) latitude, longitude (deg) and height (m) on WGS 84; None: without a geographic reference.
+    The axes of the grid are east, north and up of the origin (3,): latitude, longitude (deg) and height (m) on WGS 84.
+    Without one, they are any, and the file has no geographic reference.
 
     Raises:
         ConfigError: rasterio is not installed.

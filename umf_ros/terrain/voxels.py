@@ -33,10 +33,7 @@ PlacedScan = tuple[Points, Array, Array]
 
 
 class VoxelMap:
-    """Occupied voxels of scans in one frame.
-
-    Args:
-        cell_m: side of a voxel.
+    """Occupied voxels with sides of `cell_m`, of scans in one frame.
 
     Attributes:
         scans: number of scans that were added.
@@ -149,9 +146,6 @@ class LivingMap:
     only the newest are kept, and old odometry only around those scans and around poses of the path.
     A scan is placed by the odometry and by the correction between the poses of the path before and after it. Until the
     path reaches it, it waits. If a placed scan moves by more than half a voxel, all that are kept are placed again.
-
-    Args:
-        settings: of the ground.
 
     Attributes:
         voxels: placed scans.
