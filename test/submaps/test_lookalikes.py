@@ -11,7 +11,7 @@ from umf_ros.core.frames import Embedding, Keyframe
 from umf_ros.core.geometry import Array, invert, make_pose, relative, rotation_angle, transform
 from umf_ros.lab.simulation.scenes import CAMERA
 from umf_ros.verification import constants as const
-from umf_ros.verification.keypoints import Lookalikes, common_keypoints, find_keypoints
+from umf_ros.verification.keypoints import common_keypoints, find_keypoints, most_alike
 from umf_ros.verification.pose_search import lifted
 from umf_ros.verification.prepared_scan import PreparedScan
 
@@ -73,24 +73,19 @@ def test_keypoints_lie_where_the_relief_is() -> None:
 
 
 def test_the_right_submap_is_found_among_others_and_only_if_admissible() -> None:
-    lookalikes = Lookalikes()
-    for seed in range(12):
-        lookalikes.add(100 + seed, find_keypoints(relief(seed)))
-    assert lookalikes.rows == list(range(100, 112))
+    submaps = {100 + seed: find_keypoints(relief(seed)) for seed in range(12)}
     query = PreparedScan.of(submap(relief(7), 160, 1.5, 1.5)).keypoints
-    everything = np.arange(100, 112)
-    assert lookalikes.search(query, everything)[0] == 107
-    assert 107 not in lookalikes.search(query, everything[everything != 107])
-    assert lookalikes.search(query, np.empty(0, np.intp)) == []
+    assert most_alike(query, submaps)[0] == 107
+    del submaps[107]
+    assert 107 not in most_alike(query, submaps)
+    assert most_alike(query, {}) == []
 
 
 def test_ground_on_which_nothing_stands_out_is_like_none() -> None:
-    lookalikes, both = Lookalikes(), np.array([3, 8])
-    lookalikes.add(3, find_keypoints(LEVEL))
-    assert lookalikes.search(find_keypoints(relief(1)), both[:1]) == []
-    lookalikes.add(8, find_keypoints(relief(1)))
-    assert lookalikes.search(find_keypoints(LEVEL), both) == []
-    assert lookalikes.search(find_keypoints(relief(1)), both) == [8]
+    level, rough = find_keypoints(LEVEL), find_keypoints(relief(1))
+    assert most_alike(rough, {3: level}) == []
+    assert most_alike(level, {3: level, 8: rough}) == []
+    assert most_alike(rough, {3: level, 8: rough}) == [8]
 
 
 def test_keypoints_give_the_pose_of_a_submap() -> None:

@@ -123,7 +123,7 @@ def test_covariance_names_the_axes_of_the_match_and_turns_about_the_query() -> N
     jacobian = np.zeros((300, 6))
     jacobian[:100, 0] = jacobian[100:200, 5] = 1.0
     residuals = np.random.default_rng(0).normal(0, 0.02, 300)
-    covariance = covariance_of(Alignment(np.eye(4), residuals, jacobian, 1.0, np.empty((0, 3))).information, MODEL)
+    covariance = covariance_of(Alignment(np.eye(4), residuals, jacobian, 1.0).information, MODEL)
     deviation = np.sqrt(np.diag(covariance))
     assert deviation[0] < 0.02 and deviation[5] < 0.02
     np.testing.assert_allclose(deviation[1:3], SEARCH_M, rtol=0.01)

@@ -35,7 +35,7 @@ def aligned(rng: np.random.Generator) -> tuple[Alignment, Array]:
     jacobian = np.hstack([normals, np.cross(points - TRUE[:3, 3], normals)])
     pairs = np.column_stack([np.arange(COUNT), np.arange(COUNT)[::-1]])
     by_match = np.hstack([normals, np.cross(points, normals)])
-    return Alignment(TRUE, np.full(COUNT, 0.01), jacobian, 1.0, points, pairs), by_match
+    return Alignment(TRUE, np.full(COUNT, 0.01), jacobian, 1.0, pairs), by_match
 
 
 def walk(motion: ScanMotion, rng: np.random.Generator) -> Array:

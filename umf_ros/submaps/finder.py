@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps.history import SubmapHistory
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
-from umf_ros.verification.keypoints import Lookalikes
+from umf_ros.verification.keypoints import Keypoints, most_alike
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.verifier import NO_GUESSES
 
@@ -44,10 +45,10 @@ class SubmapFinder:
         self._rules, self._database, self._sessions = rules, database, sessions
         self._verifier = Verifier(settings)
         self.history = SubmapHistory(database.store)
-        self._lookalikes = Lookalikes()
+        self._keypoints: dict[int, Keypoints] = {}
         stored = np.unique(database.store.keys["session"]).tolist() if sessions is None else sessions
-        rows = [self.history.rows(session, 0.0, np.inf)[:: const.DESCRIBED_EVERY] for session in stored]
-        self._stored: list[int] = np.concatenate([np.empty(0, np.intp), *rows]).tolist()
+        rows = (self.history.rows(session, 0.0, np.inf)[:: const.DESCRIBED_EVERY].tolist() for session in stored)
+        self._stored: list[int] = list(chain.from_iterable(rows))
         self.reset()
 
     def retune(self, settings: Verification, rules: Loop) -> None:
@@ -123,7 +124,7 @@ class SubmapFinder:
         rows += [self._stored.pop() for _ in range(min(stored, len(self._stored)))]
         for row in rows:
             if (submap := self.history.around(row)) is not None:
-                self._lookalikes.add(row, PreparedScan.of(submap).keypoints)
+                self._keypoints[row] = PreparedScan.of(submap).keypoints
 
     def _note_closures(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> bool:
         """Whether there are closures; odometry carries the last of them on to the next keyframes."""
@@ -205,10 +206,11 @@ class SubmapFinder:
         submap = self.history.before(query)
         if submap is None:
             return []
-        rows = np.array(self._lookalikes.rows, np.intp)
+        rows = np.array(list(self._keypoints), np.intp)
         rows = rows[self._database.admissible(query, self._rules, self._sessions, rows)]
         keys = self._database.store.keys[rows]
         # scans that both submaps hold are alike for no other reason
         first_m = query.path_length_m - 2 * const.ODOMETRY_REACH_M
         apart = (keys["session"] != query.session) | (keys["travelled_m"] < first_m)
-        return self._lookalikes.search(self._verifier.scans[submap].keypoints, rows[apart])[: const.LOOKALIKES]
+        described = {row: self._keypoints[row] for row in rows[apart].tolist()}
+        return most_alike(self._verifier.scans[submap].keypoints, described)[: const.LOOKALIKES]

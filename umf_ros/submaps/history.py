@@ -251,18 +251,17 @@ class SubmapHistory:
         centre_m = keyframe.path_length_m
         last_m = min(last_m, centre_m + const.ODOMETRY_REACH_M)
         key = row, round(last_m)
-        if key not in self._submaps:
+        submap = self._submaps.pop(key, None)
+        if submap is None:
             rows = self.rows(keyframe.session, centre_m - const.ODOMETRY_REACH_M, last_m)
             others = [one for one in (self.store[i] for i in rows.tolist() if i != row) if can_be_merged(one)]
-            others.sort(key=lambda one: abs(one.path_length_m - centre_m))
+            others.sort(key=lambda one: _way_m(keyframe, one))
             submap = submap_of(keyframe, others, self.drift(keyframe.session))
-            if submap is None:
-                return None
+        if submap is not None:
             self._submaps[key] = submap
-            while len(self._submaps) > const.SCANS_KEPT:
+            if len(self._submaps) > const.SCANS_KEPT:
                 self._submaps.popitem(last=False)
-        self._submaps.move_to_end(key)
-        return self._submaps[key]
+        return submap
 
 
 def can_be_merged(keyframe: Keyframe) -> bool:

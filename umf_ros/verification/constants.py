@@ -15,7 +15,6 @@ import numpy as np
 IMAGE_THRESHOLD = 0.03  # of the image's width; geometry: a cell of the feature map is 1.8 %
 POINT_THRESHOLD_M = 0.75  # geometry: the cells of the voxel features are about a metre wide
 SERIAL_PRODUCTS = 2**18  # multiplications up to which OpenBLAS stays on one thread; its others would spin for nothing
-SUPERFEATURE_RATIO = 0.9  # [UMF eq. 4.1]
 SAME_PLACE_M = 4.0  # by hand: keyframes nearer than this, as odometry has it, show the same place
 MAX_TILT_RAD = 0.5  # by hand: a rover does not lie on its side
 
@@ -101,10 +100,10 @@ PLANE_SIGMA_M = 0.04  # measured: twice the noise of a range; .1 m tells right p
 PASSAGE_RATIO = 0.38
 PASSAGE_SURFACE = 0.1  # measured: share of points on planes; woods and orchards have less, passages from .2
 PASSAGE_COMMON = 0.25  # by hand: of the compared points that a rival needs
-PASSAGE_SHIFTS_M = np.arange(-15.0, 15.1, 0.25)  # geometry: as far as scans overlap
+# geometry: as far as scans overlap; measured: next to a pose, two steps away are no rivals, or the right pose is not
+# among the rivals of a wrong one
+PASSAGE_SHIFTS_M = np.arange(-15.0, 15.1, 0.25)
 PASSAGE_RIVALS = 16  # by hand: of these poses, that are aligned
-# measured: between these; without a distance, the right pose is not among the rivals of a wrong one
-PASSAGE_APART_M = 0.5
 # measured on validation passages: log of the ratio of misfits, and standard deviations, the larger near the identity
 PASSAGE_LEAD, PASSAGE_SIGMAS, PATTERN_M, PATTERN_SIGMAS = 0.12, 1.6, 1.3, 2.4
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -62,38 +63,26 @@ def common_keypoints(query: Keypoints, match: Keypoints) -> tuple[int, float, Ar
     return int(inliers.sum()), math.atan2(motion[1, 0], motion[0, 0]), np.asarray(motion[:, 2], float)
 
 
-class Lookalikes:
-    """Keypoints of stored submaps, found again by votes of the query's keypoints."""
+def most_alike(query: Keypoints, submaps: Mapping[int, Keypoints]) -> list[int]:
+    """Names of the submaps that share most keypoints with the query's, best first; its keypoints vote for some."""
+    if len(query.places) < const.MIN_KEYPOINTS or not submaps:
+        return []
+    names, votes = list(submaps), _votes(query, list(submaps.values()))
+    chosen = [names[one] for one in np.argsort(-votes, kind="stable")[: const.SUBMAPS_COMPARED] if votes[one] > 0]
+    counts = {name: common_keypoints(query, submaps[name])[0] for name in chosen}
+    return [name for name in sorted(counts, key=lambda name: -counts[name]) if counts[name]]
 
-    def __init__(self) -> None:
-        self.rows: list[int] = []
-        self._submaps: list[Keypoints] = []
 
-    def add(self, row: int, keypoints: Keypoints) -> None:
-        """Add the submap of a row of the database."""
-        self.rows.append(row)
-        self._submaps.append(keypoints)
-
-    def search(self, query: Keypoints, admissible: NDArray[np.intp]) -> list[int]:
-        """Rows, of those that may be returned, whose submaps share most keypoints with the query's, best first."""
-        allowed = np.flatnonzero(np.isin(self.rows, admissible))
-        if len(query.places) < const.MIN_KEYPOINTS or not len(allowed):
-            return []
-        votes = self._votes(query, allowed)
-        chosen = [int(one) for one in np.argsort(-votes, kind="stable")[: const.SUBMAPS_COMPARED] if votes[one] > 0]
-        counts = {int(allowed[one]): common_keypoints(query, self._submaps[allowed[one]])[0] for one in chosen}
-        return [self.rows[index] for index in sorted(counts, key=lambda index: -counts[index]) if counts[index]]
-
-    def _votes(self, query: Keypoints, allowed: NDArray[np.intp]) -> NDArray[np.float32]:
-        """(A,) for every allowed submap: by how much its keypoints are more like the query's than most others'."""
-        similarity = query.descriptors @ np.concatenate([self._submaps[one].descriptors for one in allowed]).T
-        owner = np.repeat(np.arange(len(allowed)), [len(self._submaps[one].places) for one in allowed])
-        if not len(owner):  # ground on which nothing stands out
-            return np.zeros(len(allowed), np.float32)
-        kept = min(const.KEYPOINT_VOTES, similarity.shape[1] - 1)
-        best = np.argpartition(-similarity, kept, axis=1)[:, : kept + 1]
-        value = np.take_along_axis(similarity, best, axis=1)
-        votes = np.zeros((len(query.places), len(allowed)), np.float32)
-        np.maximum.at(votes, (np.arange(len(votes))[:, None], owner[best]), value - value.min(axis=1, keepdims=True))
-        total: NDArray[np.float32] = votes.sum(axis=0)
-        return total
+def _votes(query: Keypoints, submaps: list[Keypoints]) -> NDArray[np.float32]:
+    """(S,) for every submap: by how much its keypoints are more like the query's than most others'."""
+    similarity = query.descriptors @ np.concatenate([one.descriptors for one in submaps]).T
+    owner = np.repeat(np.arange(len(submaps)), [len(one.places) for one in submaps])
+    if not len(owner):  # ground on which nothing stands out
+        return np.zeros(len(submaps), np.float32)
+    kept = min(const.KEYPOINT_VOTES, similarity.shape[1] - 1)
+    best = np.argpartition(-similarity, kept, axis=1)[:, : kept + 1]
+    value = np.take_along_axis(similarity, best, axis=1)
+    votes = np.zeros((len(query.places), len(submaps)), np.float32)
+    np.maximum.at(votes, (np.arange(len(votes))[:, None], owner[best]), value - value.min(axis=1, keepdims=True))
+    total: NDArray[np.float32] = votes.sum(axis=0)
+    return total

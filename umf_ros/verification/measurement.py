@@ -76,13 +76,13 @@ def _measure_scans(alignment: Alignment, match: PreparedScan, query: PreparedSca
     if match.narrow or query.narrow:
         beside = [terrain_fit(match.terrain, query.terrain, move @ level)[0] for move in _BESIDE]
         rival = {"terrain_rival": max(beside)}
-    size = np.abs(alignment.residuals) if len(alignment.points) else np.full(1, const.FINE_REACH_M)
+    size = np.abs(alignment.residuals) if len(alignment.residuals) else np.full(1, const.FINE_REACH_M)
     return {
         "residual_m": float(np.median(size)),
         "residual_p90_m": float(np.percentile(size, 90)),
         "noise_m": math.hypot(max(match.noise_m, const.MIN_NOISE_M), common_blur(match, query)),
         "overlap": alignment.overlap,
-        "points": float(len(alignment.points)),
+        "points": float(len(alignment.residuals)),
         "merged": float(max(match.merged, query.merged)),
         "terrain_correlation": correlation,
         "terrain_score": score,

@@ -156,9 +156,7 @@ def mutual_neighbours(similarity: NDArray[Any]) -> Indices:
     return np.column_stack([rows, best_column[rows]])
 
 
-def eligible_superfeatures(
-    query: SuperFeatures, match: SuperFeatures, ratio: float = const.SUPERFEATURE_RATIO
-) -> Indices:
+def eligible_superfeatures(query: SuperFeatures, match: SuperFeatures, ratio: float = 0.9) -> Indices:
     """IDs whose super-features are each other's nearest, and nearer than `ratio` times the second [UMF eq. 4.1]."""
     count = min(len(query.descriptors), len(match.descriptors))
     if count < 2:

@@ -67,7 +67,6 @@ class Alignment:
         residuals: (N,) m: point-to-plane distances of the query points that have a counterpart.
         jacobian: (N, 6) of the residuals by (x y z rx ry rz) about the match axes at the query's origin.
         overlap: share of the query points seen by both that have a counterpart.
-        points: (P, 3) m: the query points that have one, in the match's body frame.
         pairs: (N, 2) index of the query's and of the match's point behind each residual; one row per residual.
     """
 
@@ -75,7 +74,6 @@ class Alignment:
     residuals: Array
     jacobian: Array
     overlap: float
-    points: Array
     pairs: NDArray[np.intp] = field(default_factory=lambda: np.empty((0, 2), np.intp))
 
     @property
@@ -129,7 +127,7 @@ def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
     arm = np.cross(moved[close] - pose[:3, 3], normals[close])
     overlap = float(close.sum()) / max(int(seen.sum()), 1)
     pairs = np.column_stack([query.picks, index])[close]
-    return Alignment(pose, residual[close], np.hstack([normals[close], arm]), overlap, moved[close], pairs)
+    return Alignment(pose, residual[close], np.hstack([normals[close], arm]), overlap, pairs)
 
 
 def covariance_of(found: Array, model: CovarianceModel, overlap: float | Array = 1.0) -> Array:

@@ -165,7 +165,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     misfits, known = _misfits(match, query, poses)
     means = _means(misfits, known)
     first = int(np.argmin(means[: 1 + len(aligned)]))
-    elsewhere = np.abs((poses[:, :3, 3] - poses[first, :3, 3]) @ way) > const.PASSAGE_APART_M
+    elsewhere = np.abs((poses[:, :3, 3] - poses[first, :3, 3]) @ way) > 2 * np.ptp(const.PASSAGE_SHIFTS_M[:2])
     both = known[elsewhere] & known[first]
     worse = np.where(both, misfits[elsewhere] - misfits[first], 0.0)
     points = [transform(poses[first], half) for half in _halves(query)] + _halves(match)
@@ -213,8 +213,7 @@ def _peaks(means: Array) -> list[int]:
     """The best of the shifts along a passage, apart from each other, by their mean misfits."""
     picks: list[int] = []
     for number in np.argsort(means).tolist():
-        apart = np.abs(const.PASSAGE_SHIFTS_M[picks] - const.PASSAGE_SHIFTS_M[number])
-        if len(picks) < const.PASSAGE_RIVALS and np.all(apart >= const.PASSAGE_APART_M):
+        if len(picks) < const.PASSAGE_RIVALS and all(abs(number - other) > 1 for other in picks):
             picks.append(number)
     return picks
 
