@@ -78,7 +78,8 @@ class OpenVinoRuntime:
         self.file = weights if self.precision == "float32" else path
         # half precision changes similarities by more than a threshold tolerates
         options: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": threads}
-        options |= {"NUM_STREAMS": 1, "PERFORMANCE_HINT": "LATENCY"}
+        # pinned threads of two networks share one core
+        options |= {"NUM_STREAMS": 1, "PERFORMANCE_HINT": "LATENCY", "ENABLE_CPU_PINNING": False}
         self._model = openvino_core().compile_model(model, "CPU", options)
 
     def run(self, inputs: Arrays) -> Outputs:
