@@ -34,6 +34,8 @@ logger = logging.getLogger(__name__)
 Other = TypeVar("Other")
 """Items of a stream beside frames, such as odometry."""
 NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
+MOST_HELD = 400
+"""Most items of a recording that are read ahead for the next keyframe; bounds the memory (*by hand*)."""
 COUNTED_STEP_M = 0.05
 """Least motion that counts: odometry noise of a parked rover must not add up to metres (*by hand*)."""
 NOT_EMBEDDED = Embedding(np.empty(0, np.float32))
@@ -145,6 +147,7 @@ class LoopDetector:
         database: the rover's places.
         seen: its places while it localises in a map that grows, in sessions of their own; None: they are not kept.
         inter_robot: closures with other rovers of a fleet; None of a rover on its own.
+        embedder_name: name of the network.
         embed_ms: milliseconds that the last embedding took, prefetched or not.
 
     Raises:
@@ -155,13 +158,15 @@ class LoopDetector:
         small_gicp.PointCloud(np.eye(3))  # its binding must be initialised before there are other threads
         self._rules = settings.loop
         self._selector = KeyframeSelector(settings.keyframe)
-        self._embedder = embedder
+        self._embedder, self.embedder_name = embedder, embedder.name
         self._verifier = Verifier(settings.verification)
-        self.database = _open_places(settings, embedder)
+        identity = embedder.name, embedder.dimension
+        if settings.localizing:
+            self.database = PlaceDatabase.of_map(Path(settings.map), *identity)
+        else:
+            self.database = PlaceDatabase(settings.database, *identity)
         self._map = self.database.listed
-        self.seen: PlaceDatabase | None = None
-        if settings.grows_map:
-            self.seen = PlaceDatabase(settings.database, embedder.name, embedder.dimension)
+        self.seen = PlaceDatabase(settings.database, *identity) if settings.grows_map else None
         self._submaps = SubmapFinder(settings.verification, settings.loop, self.database, self._map)
         self.inter_robot = _connect_fleet(settings, embedder, self._submaps.history)
         self._session: int | None = None
@@ -179,13 +184,8 @@ class LoopDetector:
         self._verifier.retune(settings.verification)
         self._submaps.retune(settings.verification, settings.loop)
 
-    @property
-    def embedder_name(self) -> str:
-        """Name of the network."""
-        return self._embedder.name
-
-    def process(self, frame: Frame) -> Detection:
-        """Process one frame, in order of stamps within a session."""
+    def process(self, frame: Frame, publish: Callable[[Detection], None] = lambda _: None) -> Detection:
+        """Process one frame, in order of stamps within a session; `publish` gets the result before it is stored."""
         if not self.select(frame):
             return Detection(frame.stamp_ns)
         keyframe = self.embed(frame)
@@ -197,14 +197,15 @@ class LoopDetector:
             candidates = self.query(keyframe)
         with _timed(latency, "verify"):
             verdicts = self.verify(keyframe, candidates)
-        fault = None
         with _timed(latency, "submaps"):
             verdicts = self.match_submaps(keyframe, verdicts)
+        detection = Detection(frame.stamp_ns, keyframe, verdicts, latency | {"total": sum(latency.values())})
+        publish(detection)
         try:
             self.remember(keyframe, known is not None)
         except OutputError as error:
-            fault = error
-        return Detection(frame.stamp_ns, keyframe, verdicts, latency | {"total": sum(latency.values())}, fault)
+            return replace(detection, fault=error)
+        return detection
 
     def prefetch(
         self, stream: Iterable[Frame | Other], wanted: Callable[[], bool] = lambda: True
@@ -219,9 +220,9 @@ class LoopDetector:
         for item in stream:
             if isinstance(item, Frame):
                 self._queue.append(self._decide(item))
-                if self._queue[-1].is_keyframe:
-                    if wanted():
-                        self._begin(self._queue[-1])
+                if self._queue[-1].is_keyframe and wanted():
+                    self._begin(self._queue[-1])
+                if self._queue[-1].is_keyframe or len(held) >= MOST_HELD:  # a parked rover has no next one
                     yield from held
                     held.clear()
             held.append(item)
@@ -348,25 +349,7 @@ class LoopDetector:
         return keyframe
 
 
-def _open_places(settings: Settings, embedder: Embedder) -> PlaceDatabase:
-    """Return the place database of the settings, or of the map to localise in."""
-    if settings.localizing:
-        return PlaceDatabase.of_map(Path(settings.map), embedder.name, embedder.dimension)
-    return PlaceDatabase(settings.database, embedder.name, embedder.dimension)
-
-
-def make_keyframe(frame: Frame, embedder: Embedder, path_length_m: float = float("nan")) -> Keyframe:
-    """Return the keyframe of a frame: embedded, its features lifted to 3-D, its scan thinned.
-
-    Args:
-        frame: synchronised measurements.
-        embedder: the network.
-        path_length_m: metres driven since the start of the session, NaN when unknown.
-    """
-    return assemble(frame, lift(frame, embedder.embed(frame)), path_length_m)
-
-
-def assemble(frame: Frame, embedding: Embedding, path_length_m: float, session: int = 0) -> Keyframe:
+def assemble(frame: Frame, embedding: Embedding, path_length_m: float = math.nan, session: int = 0) -> Keyframe:
     """Return the keyframe of a frame whose embedding is known, its scan thinned."""
     points, motion = thin_frame(frame)
     return Keyframe(

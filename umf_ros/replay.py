@@ -61,7 +61,7 @@ class Replay:
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometrySessionSplitter(self._graph)
         self.sensor_check = SensorCheck()
-        self._checking = ThreadPoolExecutor(1, "sensor-check")  # OpenCV and small_gicp release the interpreter lock
+        self._checking = ThreadPoolExecutor(1, "sensor-check")  # OpenCV releases the interpreter lock
         self._unchecked: deque[Future[None]] = deque()
         self.faults = 0
         self.counts: dict[str, Any] = {"keyframes": 0, "keyframes_until_found": None, "located": 0}

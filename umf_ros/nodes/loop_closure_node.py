@@ -155,7 +155,7 @@ class LoopClosureNode(BaseNode):
             wanted, self._wanted = self._wanted, None
             if wanted is not None:
                 self._detector.retune(wanted)
-            detection = self._detector.process(frame)
+            detection = self._detector.process(frame, self._publisher.publish_closures)
             # before the database drops them
             matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
         self._last = detection
@@ -257,13 +257,16 @@ class ClosurePublisher:
         self._accepted: deque[Array] = deque(maxlen=MAX_LINES)
         self._rejected: deque[Array] = deque(maxlen=MAX_LINES)
 
+    def publish_closures(self, detection: Detection) -> None:
+        """Publish the closures of one detection."""
+        for closure in detection.closures:
+            self._closures.publish(closure_to_message(closure))
+
     def announce(self, detection: Detection, matches: dict[int, Keyframe]) -> None:
-        """Publish one detection; `matches` are the matched keyframes by stamp, for the markers."""
+        """Publish the rest of one detection; `matches` are the matched keyframes by stamp, for the markers."""
         keyframe = detection.keyframe
         if keyframe is None:
             return
-        for closure in detection.closures:
-            self._closures.publish(closure_to_message(closure))
         # without odometry a keyframe is at the origin of its own frame
         known = keyframe.odom_T_body is not None
         header = to_header(keyframe.stamp_ns, self.odom if known else keyframe_frame(keyframe.stamp_ns))

@@ -20,7 +20,7 @@ from umf_ros.core.config import KeyframePolicy, Verification
 from umf_ros.core.errors import BagError, ConfigError, UmfError, writing
 from umf_ros.core.frames import Candidate, Frame, Image, Keyframe, LoopClosure, Points
 from umf_ros.core.geometry import transform
-from umf_ros.detector import NOT_EMBEDDED, KeyframeSelector, assemble, make_keyframe
+from umf_ros.detector import NOT_EMBEDDED, KeyframeSelector, assemble
 from umf_ros.embedding import Embedder
 from umf_ros.embedding.depth import lift
 from umf_ros.lab.scan_files import (
@@ -200,7 +200,7 @@ class Comparer:
             names = ["", ""]
         left, right = (fit_image(read_image(Path(name)), self._calibration) if name else None for name in names)
         frame = make_snapshot(cloud, left, right, self._calibration, warn=self._warn)
-        keyframe = make_keyframe(frame, self._embedder)
+        keyframe = assemble(frame, lift(frame, self._embedder.embed(frame)))
         if not view.left and not len(keyframe.points):
             raise SensorFileError(f"{view.scan} has {OUT_OF_REACH}")
         return keyframe

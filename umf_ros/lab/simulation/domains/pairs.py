@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.frames import Candidate, Embedding, Keyframe, LoopClosure, ScanMotion
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.core.io import atomic_write
-from umf_ros.detector import make_keyframe
+from umf_ros.detector import assemble
 from umf_ros.embedding import Embedder
+from umf_ros.embedding.depth import lift
 from umf_ros.lab.scan_files import UNCALIBRATED, make_snapshot
 from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
 from umf_ros.lab.simulation.domains.passages import Passage
@@ -123,7 +124,7 @@ def keyframe_of(
     frame = make_snapshot(cloud, stamp_ns=stamp_ns)
     if steady and frame.points is not None:
         frame = replace(frame, motion=ScanMotion.none(len(frame.points)))
-    return make_keyframe(frame, embedder)
+    return assemble(frame, lift(frame, embedder.embed(frame)))
 
 
 def places_of(
