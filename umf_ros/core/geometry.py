@@ -7,6 +7,7 @@ GTSAM's tangent order: (rx, ry, rz, x, y, z) in the child frame.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -66,13 +67,14 @@ def transform(a_T_b: Array, points_b: Array) -> Array:
 
 def rotation_angle(pose: ArrayLike) -> float:
     """Return the angle of the pose's rotation in radians, 0 to pi."""
-    return float(Rotation.from_matrix(np.asarray(pose)[:3, :3]).magnitude())
+    turn = np.asarray(pose)
+    axis = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
+    return math.atan2(math.hypot(*axis), turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0)
 
 
 def near(a: Array, b: Array, metres: float, radians: float) -> bool:
     """Return whether two poses in one frame are nearer to each other than these tolerances."""
-    gap = relative(a, b)
-    return bool(np.linalg.norm(gap[:3, 3]) < metres and rotation_angle(gap) < radians)
+    return bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) < metres) and rotation_angle(relative(a, b)) < radians
 
 
 def heading(world_T_body: Array) -> Any:

@@ -136,7 +136,7 @@ def decode_cloud(message: Any) -> Cloud:
     """
     records = _cloud_records(message) if hasattr(message, "fields") else _livox_records(message)
     cloud, real = real_returns(records, records.dtype.names or ())
-    return replace(cloud, time_offset_ns=_time_offsets_ns(records[real], message))
+    return replace(cloud, time_offset_ns=_time_offsets_ns(records, real, message))
 
 
 def real_returns(columns: Any, names: Collection[str]) -> tuple[Cloud, NDArray[np.bool_]]:
@@ -157,12 +157,12 @@ def real_returns(columns: Any, names: Collection[str]) -> tuple[Cloud, NDArray[n
     return Cloud(points[real], None if intensity is None else intensity[real]), real
 
 
-def _time_offsets_ns(records: NDArray[Any], message: Any) -> NDArray[np.int64] | None:
-    """Return (N,) ns after the message's stamp; drivers count from there or from the epoch. None without times."""
+def _time_offsets_ns(records: NDArray[Any], real: NDArray[np.bool_], message: Any) -> NDArray[np.int64] | None:
+    """Return ns from the message's stamp to real returns; drivers count from there or the epoch. None without times."""
     name = next((name for name in TIME_NAMES if name in (records.dtype.names or ())), None)
     if name is None:
         return None
-    times = records[name]
+    times = records[name][real]
     if times.dtype.kind in "ui":
         offsets = times.astype(np.int64)
     elif len(times) and times[0] > 1e17:  # ns since the epoch, as Livox' driver for PCL writes them
