@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.overlay import Overlay, lay_over, overlay_equations
-from umf_ros.core.frames import Frame, Image, Points
+from umf_ros.core.frames import Frame, Image
 from umf_ros.core.geometry import Array, invert
 from umf_ros.core.trajectory import Trajectory, interpolated
 from umf_ros.embedding.depth import disparities
@@ -32,6 +32,8 @@ ROUNDS = 5  # of reweighting
 KNOWN = 0.02  # by hand: least share of the second direction of motion for an observable mounting
 BETTER = 0.75  # by hand: residual at another lag over that at lag 0, below which a clock is reported
 CONTRAST = 0.6  # by hand: residual at the best lag over the median one, above which the lag is unknown
+
+MeasuredScan = tuple[small_gicp.PointCloud, small_gicp.KdTree, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,40 +66,35 @@ class Disagreement:
     mounting_deg: Array | None
 
 
-def as_measured(frame: Frame) -> tuple[Points, float]:
-    """Return the scan (N, 3) m as measured, with its motion distortion, and its mean time, s after the frame's stamp.
+def as_measured(frame: Frame) -> MeasuredScan | None:
+    """Return the scan as measured, with its motion distortion, thinned, and its mean time; None with few points.
 
     The distortion was removed by the odometry, clock and mounting under test, which biases the motion between scans
     towards them. The mean is weighted by squared range, as the points are in an alignment of rotations.
     """
     assert frame.points is not None
-    if frame.motion is None or not len(frame.points):
-        return frame.points, 0.0
-    moments = frame.motion.moments_s
-    turns = Rotation.from_rotvec(-moments[:, None] * frame.motion.rates[3:])
-    measured = turns.apply(frame.points - moments[:, None] * frame.motion.rates[:3])
-    cell = np.floor(frame.points / SCAN_CELL_M).astype(np.int64) & CELL_MASK
-    # the points that remain after the alignment thins them
-    thinned = np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)[1]
-    levers: Array = np.square(frame.points[thinned].astype(float)).sum(axis=1)
-    return measured.astype(np.float32), float(np.average(moments[thinned], weights=levers + 1e-9))
-
-
-def scan_step(earlier: Frame, later: Frame) -> Step | None:
-    """Return the motion of the body between two scans; None if they do not align."""
-    (before, before_s), (after, after_s) = as_measured(earlier), as_measured(later)
-    if min(len(before), len(after)) < MIN_SCAN_POINTS:
+    if len(frame.points) < MIN_SCAN_POINTS:
         return None
-    found = small_gicp.align(
-        before.astype(float),
-        after.astype(float),
-        downsampling_resolution=SCAN_CELL_M,
-        max_correspondence_distance=SCAN_REACH_M,
-        num_threads=1,
-    )
+    measured, mean_s = frame.points, 0.0
+    if frame.motion is not None:
+        moments = frame.motion.moments_s
+        turns = Rotation.from_rotvec(-moments[:, None] * frame.motion.rates[3:])
+        measured = turns.apply(frame.points - moments[:, None] * frame.motion.rates[:3]).astype(np.float32)
+        cell = np.floor(frame.points / SCAN_CELL_M).astype(np.int64) & CELL_MASK
+        # the points that remain after the alignment thins them
+        thinned = np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)[1]
+        levers: Array = np.square(frame.points[thinned].astype(float)).sum(axis=1)
+        mean_s = float(np.average(moments[thinned], weights=levers + 1e-9))
+    cloud, tree = small_gicp.preprocess_points(measured.astype(float), SCAN_CELL_M, num_threads=1)
+    return cloud, tree, frame.stamp_ns + round(mean_s * 1e9)
+
+
+def scan_step(before: MeasuredScan, after: MeasuredScan) -> Step | None:
+    """Return the motion of the body between two scans; None if they do not align."""
+    (target, tree, start_ns), (source, _, end_ns) = before, after
+    found = small_gicp.align(target, source, tree, max_correspondence_distance=SCAN_REACH_M, num_threads=1)
     turn = Rotation.from_matrix(found.T_target_source[:3, :3]).as_rotvec()
-    stamps = earlier.stamp_ns + round(before_s * 1e9), later.stamp_ns + round(after_s * 1e9)
-    return Step(*stamps, turn, found.T_target_source[:3, 3]) if found.converged else None
+    return Step(start_ns, end_ns, turn, found.T_target_source[:3, 3]) if found.converged else None
 
 
 def view_step(earlier: Frame, later: Frame) -> Step | None:
@@ -245,6 +242,7 @@ class SensorCheck:
         self._overlaid: list[Array] = []
         self._frames = 0
         self._last: Frame | None = None
+        self._last_scan: tuple[Frame | None, MeasuredScan | None] = None, None
         self._scan_steps: list[Step] = []
         self._view_steps: list[Step] = []
 
@@ -302,7 +300,10 @@ class SensorCheck:
         if poses[0] is not None and poses[1] is not None and np.linalg.norm((poses[1] - poses[0])[:3, 3]) < MOVES_M:
             return
         if earlier.points is not None and later.points is not None:
-            found = scan_step(earlier, later)
+            known, before = self._last_scan
+            before, after = before if known is earlier else as_measured(earlier), as_measured(later)
+            self._last_scan = later, after
+            found = scan_step(before, after) if before and after else None
             self._scan_steps += [found] if found else []
         if earlier.image_stamp_ns and later.image_stamp_ns:
             found = view_step(earlier, later)
