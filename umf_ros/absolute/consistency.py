@@ -15,7 +15,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteReason, AbsoluteVerdict, Aid
 from umf_ros.core.frames import State
@@ -24,7 +24,7 @@ from umf_ros.core.odometry_noise import OdometryNoise
 
 STRETCH_M = 10.0
 """Path length over which measurements are averaged (*by hand*: multipath jumps further than odometry drifts in it)."""
-GATE = float(chi2.ppf(0.999, 3))
+GATE = float(chdtri(3, 1 - 0.999))
 """Largest squared Mahalanobis distance of a right measurement."""
 SUPPORT = 4
 """Least number of consecutive stretches that agree (*by hand*: longer than the path through one reflection)."""

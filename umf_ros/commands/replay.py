@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -71,21 +72,6 @@ def command(
     check_map(map_folder)
     odometry_frame = check_odometry_options(odometry, odometry_frame)
 
-    from rich.console import Console
-
-    from umf_ros.bags.inputs import absent_inputs, input_counts
-    from umf_ros.bags.trajectories import read_ground_truth
-    from umf_ros.commands.console import WARNING, FrameProgress, stop_on_interrupt, undisturbed
-    from umf_ros.core.watchdog import watching
-    from umf_ros.detector import LoopDetector, make_detector_embedder
-    from umf_ros.replay import Replay
-    from umf_ros.runs.reader import read_run, remember_recording
-    from umf_ros.runs.report import finish_run
-    from umf_ros.runs.rerun_log import RerunLog
-    from umf_ros.runs.run_file import read_odometry_of
-    from umf_ros.runs.writer import count_drops, create_folder, finish_folder, unfinished_folder, with_places
-
-    console = Console()
     recording, settings = open_recording(
         bag,
         config,
@@ -96,13 +82,30 @@ def command(
         mode=mode or ("localization" if map_folder else None),
         map=str(map_folder) if map_folder else None,
     )
+    from umf_ros.detector import LoopDetector, make_detector_embedder
+
+    # the network is compiled while the rest is imported
+    starting = ThreadPoolExecutor(1, "start").submit(make_detector_embedder, settings)
+    from rich.console import Console
+
+    from umf_ros.bags.inputs import absent_inputs, input_counts
+    from umf_ros.bags.trajectories import read_ground_truth
+    from umf_ros.commands.console import WARNING, FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.core.watchdog import watching
+    from umf_ros.replay import Replay
+    from umf_ros.runs.reader import read_run, remember_recording
+    from umf_ros.runs.rerun_log import RerunLog
+    from umf_ros.runs.run_file import read_odometry_of
+    from umf_ros.runs.writer import count_drops, create_folder, finish_folder, unfinished_folder, with_places
+
+    console = Console()
     _tell_inputs(console, settings)
     warnings: list[str] = []
     reader = open_frames(recording, settings, partial(_warn, console, warnings), odometry, odometry_frame)
     truth = read_ground_truth(None, ground_truth)
     if settings.localizing and rerun:
         raise ConfigError("--rerun is for mapping runs: leave it out with --map")
-    network = make_detector_embedder(settings)
+    network = starting.result()
     viewer = RerunLog(rerun, settings.terrain) if rerun else None
     # a store or a map that cannot be used is reported before there is a folder
     known = settings.database.path or (settings.localizing and not settings.grows_map)
@@ -143,6 +146,8 @@ def command(
         if settings.localizing:
             status = _report_localization(console, folder, replay.counts, newest)
         else:
+            from umf_ros.runs.report import finish_run  # Matplotlib delays a start
+
             truth = truth or (read_ground_truth(recording) if interrupted() else reader.ground_truth)
             sensors = replay.sensor_check.report(read_odometry_of(folder))
             run = read_run(folder, recording, truth)

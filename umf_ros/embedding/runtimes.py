@@ -10,6 +10,7 @@ import os
 import sys
 import zipfile
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -80,7 +81,7 @@ class OpenVinoRuntime:
         options: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": threads}
         # pinned threads of two networks share one core
         options |= {"NUM_STREAMS": 1, "PERFORMANCE_HINT": "LATENCY", "ENABLE_CPU_PINNING": False}
-        self._model = openvino_core().compile_model(model, "CPU", options)
+        self._model = openvino_core().compile_model(model, "CPU", options | _cache_options())
 
     def run(self, inputs: Arrays) -> Outputs:
         """Return the outputs of a batch of one; see `Runtime`."""
@@ -174,10 +175,16 @@ def name_outputs(weights: Path, runtime: Runtime, preprocessing: bytes = b"") ->
 
 
 def import_openvino() -> Any:
-    """Return the module OpenVINO without its telemetry, which starts a process and sends a message at every import."""
-    sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]  # OpenVINO allows for its absence
+    """Return the module OpenVINO without its telemetry, which starts a process and sends a message at every import.
+
+    Its converter, most of the time of the import, is left out as well; `openvino.tools.ovc` can be imported afterwards.
+    """
+    for name in ("openvino.tools.ovc", "openvino_telemetry"):  # OpenVINO allows for their absence
+        sys.modules.setdefault(name, None)  # type: ignore[arg-type]
     import openvino
 
+    if sys.modules["openvino.tools.ovc"] is None:
+        del sys.modules["openvino.tools.ovc"]
     return openvino
 
 
@@ -189,6 +196,16 @@ def openvino_core() -> Any:
     core was created and destroyed crashes at Ctrl-C.
     """
     return import_openvino().Core()
+
+
+def _cache_options() -> dict[str, str]:
+    """Return OpenVINO's option to keep compiled models, if there is a folder for them; it ignores damaged ones."""
+    with suppress(OSError, RuntimeError):  # RuntimeError: no home
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "umf_ros"
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return {"CACHE_DIR": str(folder)}
+    return {}
 
 
 def _wants_openvino(weights: Path, settings: EmbeddingSettings) -> bool:

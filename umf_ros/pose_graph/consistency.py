@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, adjoint, invert, logmap, propagate
@@ -79,7 +78,8 @@ def likelihood_ratio(false_alarms: Array, distances: Array, settings: PoseGraphS
         distances: (N,) squared Mahalanobis distances from them; those below that of most right closures count alike.
         settings: of the pose graph.
     """
-    right = chi2.pdf(np.maximum(distances, _DEGREES - 2), _DEGREES)
+    rising = np.maximum(distances, _DEGREES - 2)
+    right = rising**2 * np.exp(-rising / 2) / 16  # density of a chi-square of six degrees of freedom
     return np.minimum(false_alarms / settings.gate_chi2 / np.maximum(right, 1e-12), 1.0)
 
 

@@ -228,7 +228,10 @@ def save_model(model: Any, path: Path) -> None:
 
 def convert(network: nn.Module, example: dict[str, Any], outputs: tuple[str, ...]) -> Any:
     """Return the OpenVINO model of a network, with named inputs of the shapes of the example, and named outputs."""
-    model = import_openvino().convert_model(network, example_input=tuple(example.values()))
+    import_openvino()
+    from openvino.tools.ovc import convert_model
+
+    model = convert_model(network, example_input=tuple(example.values()))
     shapes = [tuple(tensor.shape) for tensor in example.values()]
     model.reshape(dict(zip(model.inputs, shapes, strict=True)))
     for ports, names in ((model.inputs, example), (model.outputs, outputs)):
