@@ -1,10 +1,13 @@
 """Print latencies of the back-end at the end of a long drive, and its memory; with `--start`, those of a start.
 
-`python benchmarks/scale/latency.py [--poses 20000] [--quick] [--start RECORDING]`
+`python benchmarks/scale/latency.py [--poses 20000] [--quick] [--start RECORDING] [--bag RECORDING]`
 
 A node resumes a stored graph and receives the last 40 closures over DDS, with odometry at 20 Hz: its executor's longest
 stall, the time from a closure to its verdict, memory and time to shut down. CPU times are of the graph alone. `--start`
 prints the times from `umf replay` to the first keyframe of a recording in its run folder, of three starts.
+
+`--bag`: a recording of the simulator is played to front-end and back-end, and again with `map_node` and its listener:
+time from a scan to the closures of its keyframe, at this process.
 """
 
 from __future__ import annotations
@@ -17,6 +20,15 @@ import tempfile
 import time
 from contextlib import closing, suppress
 from pathlib import Path
+
+import numpy as np
+import rclpy
+from nav_msgs.msg import OccupancyGrid, Odometry
+from sensor_msgs.msg import PointCloud2
+
+from umf_ros.core.config import Settings, topics_of
+from umf_ros.lab.live.live_graph import NODES, PLAYER, WHOLE, NodeProcess
+from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, closure_from_message, from_time, sensor_qos
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "robustness"))
 
@@ -50,15 +62,65 @@ def start_of_replay_s(recording: Path) -> float:
     return float("nan")
 
 
+def closures_of(bag: Path, folder: Path, modules: tuple[str, ...]) -> tuple[list[float], int]:
+    """Play a recording to nodes; return ms from scans to their closures, and the number of maps that were heard."""
+    given = [word for text in WHOLE for word in ("-p", text)]
+    nodes = [NodeProcess(module, ["--ros-args", *given], folder, lambda _: None) for module in modules]
+    scans: dict[int, float] = {}
+    closures: list[float] = []
+    maps: list[OccupancyGrid] = []
+
+    def take_closure(message: Odometry) -> None:
+        began_s = scans.get(closure_from_message(message).query_stamp_ns)
+        if began_s is not None:  # this process heard the scan
+            closures.append(1e3 * (time.monotonic() - began_s))
+
+    def take_scan(message: PointCloud2) -> None:
+        scans[from_time(message.header.stamp)] = time.monotonic()
+
+    listener = rclpy.create_node("listener")
+    topic = topics_of(Settings(dataset="simulated")).cloud
+    listener.create_subscription(PointCloud2, topic, take_scan, sensor_qos(Settings().qos, 50))
+    listener.create_subscription(Odometry, "loop_closures", take_closure, CLOSURES_QOS)
+    listener.create_subscription(OccupancyGrid, "map_node/map_grid", maps.append, LATCHED_QOS)
+    try:
+        for node in nodes:
+            node.wait_ready()
+        player = NodeProcess(PLAYER, [str(bag.resolve()), "--wait-for-subscribers", "--quiet"], folder, lambda _: None)
+        while player.exit_code is None:
+            rclpy.spin_once(listener, timeout_sec=0.05)
+        player.stop()
+    finally:
+        for node in nodes:
+            node.stop()
+        listener.destroy_node()
+    return closures, len(maps)
+
+
+def with_and_without_map(bag: Path, folder: Path) -> None:
+    """Print the latency of closures with the map and without."""
+    rclpy.init()
+    for name, modules in (("without map_node", NODES), ("with map_node", (*NODES, "umf_ros.nodes.map_node"))):
+        closures, maps = closures_of(bag, folder, modules)
+        p50, p95 = np.percentile(closures, [50, 95])
+        print(f"{name:18s} scan to closure, ms: p50 {p50:6.1f}, p95 {p95:6.1f}; {len(closures)} closures, {maps} grids")
+    rclpy.shutdown()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--poses", type=int, default=20_000, help="of the drive, one metre apart")
     parser.add_argument("--quick", action="store_true", help="2,000 poses")
     parser.add_argument("--start", type=Path, help="a recording: time the start of its replay instead")
+    parser.add_argument("--bag", type=Path, help="recording of the simulator: closures with and without map_node")
     arguments = parser.parse_args()
     if arguments.start is not None:
         seconds = " ".join(f"{start_of_replay_s(arguments.start):.2f}" for _ in range(3))
         print(f"umf replay to the first keyframe, s: {seconds}")
+        return
+    if arguments.bag is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            with_and_without_map(arguments.bag, Path(folder))
         return
     poses = 2_000 if arguments.quick else arguments.poses
     with tempfile.TemporaryDirectory() as folder:

@@ -123,9 +123,10 @@ def test_an_antenna_elsewhere_is_told() -> None:
     assert error_m(graph) <= 1.05 * error_m(drive([]))
 
 
-@pytest.mark.xfail(strict=True, reason="too few stretches with fixes: a mounting error is believed until it is known")
+@pytest.mark.xfail(strict=True, reason="fixes and odometry of this world fit this lever arm better than the true one")
 def test_an_antenna_elsewhere_is_told_where_few_stretches_have_fixes() -> None:
-    # found in this world: 216 fixes are believed, and the map is 7 % worse than without them
+    # found in this world: 216 fixes are accepted, and the map is 7 % worse than without them; the cost of the graph is
+    # 23 with this lever arm and 35 with the true one, and its minimum over lever arms is 1.5 m from either
     world, graph = open_ground(10_004, 400.0), PoseGraph(BASE.model_copy(update={"origin": ORIGIN}))
     for k, pose in enumerate(world.graph.odometry):
         graph.add_odometry(k * PERIOD_NS, pose)

@@ -1,4 +1,4 @@
-"""The real graph over DDS: player, front-end, back-end and a foreign SLAM system, against the replay."""
+"""The real graph over DDS: player, front-end, back-end, map and a foreign SLAM system, against the replay."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import yaml
 from processes import Process, wait_until
 
 from umf_ros.bags.frames import FrameReader
@@ -42,7 +44,8 @@ def live(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFac
     folder = tmp_path_factory.mktemp("live")
     common = ["--ros-args", "--params-file", str(mini_config), "-p", f"results_dir:={folder}", *QOS]
     # the front-end finds its topics; the player does not wait for a back-end that is still searching
-    named = {"loop_closure_node": [], "pose_graph_node": ["-p", "topics.odometry:=/odom"]}
+    odometry = ["-p", "topics.odometry:=/odom"]
+    named = {"loop_closure_node": [], "pose_graph_node": odometry, "map_node": odometry}
     nodes = [
         Process("", folder / f"{name}.log", command=[sys.executable, "-m", f"umf_ros.nodes.{name}", *common, *more])
         for name, more in named.items()
@@ -52,10 +55,12 @@ def live(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFac
     try:
         nodes[0].wait_for("waiting for topics")  # no parameter names one
         nodes[1].wait_for("ready")
+        nodes[2].wait_for("ready")
         player = Process("", folder / "player.log", command=[*player_command, "--wait-for-subscribers", "--quiet"])
         wait_until(lambda: player.exit_code is not None, 240)
         assert player.exit_code == 0, player.output
         player.kill()
+        assert nodes[2].interrupt() == 0, nodes[2].output
         assert nodes[0].interrupt() == 0, nodes[0].output
         assert nodes[1].interrupt() == 0, nodes[1].output
         subscriber.interrupt()
@@ -94,6 +99,16 @@ def test_live_and_offline_optimise_the_same_graph(live: LiveRun, offline: Path) 
     poses = [read_tum(folder / "trajectory_optimized.tum") for folder in (live.folder, offline)]
     np.testing.assert_array_equal(poses[0].stamps_ns, poses[1].stamps_ns)
     np.testing.assert_allclose(poses[0].poses, poses[1].poses, atol=1e-5)
+
+
+def test_the_ground_of_the_drive_is_in_the_map(live: LiveRun) -> None:
+    about = yaml.safe_load((live.folder / "map.yaml").read_text())
+    image = cv2.imread(str(live.folder / about["image"]), cv2.IMREAD_UNCHANGED)[::-1]  # rows with y
+    driven = read_tum(live.folder / "trajectory_optimized.tum").poses[:, :2, 3]
+    column, row = np.floor((driven - about["origin"][:2]) / about["resolution"]).astype(int).T
+    inside = (row >= 0) & (column >= 0) & (row < image.shape[0]) & (column < image.shape[1])
+    shades = image[row[inside], column[inside]]
+    assert inside.mean() > 0.9 and (shades == 254).mean() > 0.5 and (shades == 0).mean() < 0.05
 
 
 def test_every_scan_with_an_image_becomes_a_pair(live: LiveRun, offline: Path) -> None:

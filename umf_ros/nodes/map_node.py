@@ -64,8 +64,10 @@ class MapNode(BaseNode):
 
     def _finish(self) -> None:
         self._worker.close(timeout_s=watchdog.PATIENT_S)
-        if self._results and len(self._map.voxels):
-            self._save()
+        if self._results:
+            self._update()  # without subscribers there was none
+            if len(self._map.voxels):
+                self._save()
 
     def _retune(self, settings: Settings) -> None:
         """Nothing of the map changes while the node runs."""
