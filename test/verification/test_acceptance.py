@@ -20,7 +20,7 @@ from umf_ros.verification.acceptance import (
     refuted,
     scores,
 )
-from umf_ros.verification.constants import MAX_MISFIT, MIN_RUNNER_UP, MIN_TERRAIN, SUBMAP_UNEXPLAINED
+from umf_ros.verification.constants import MAX_MISFIT, MIN_LEAD, MIN_TERRAIN, SUBMAP_UNEXPLAINED
 from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, kind_of
 
 RIVALS, STANDING = ("rival_near", "rival_far"), ("upright_counterparts", "unexplained")
@@ -206,10 +206,11 @@ def test_what_was_never_measured_is_not_what_a_closure_was_lost_by(shipped: Acce
     ("measurements", "reason"),
     [
         (GOOD, None),
-        (GOOD | {"runner_up": 1.01 * MIN_RUNNER_UP}, None),
-        (GOOD | {"runner_up": 0.99 * MIN_RUNNER_UP}, RejectReason.AMBIGUOUS),
-        (GOOD | {"passage_lead": 1.01}, None),
-        (GOOD | {"passage_lead": 0.99}, RejectReason.PASSAGE),
+        (GOOD | {"runner_up": 1.01 * MIN_LEAD}, None),
+        (GOOD | {"runner_up": 0.99 * MIN_LEAD}, RejectReason.AMBIGUOUS),
+        (GOOD | {"lead": 1.01}, None),
+        (GOOD | {"lead": 0.99}, RejectReason.AMBIGUOUS),
+        (without(GOOD, *RIVALS) | {"lead": 0.99}, RejectReason.PASSAGE),
         (GOOD | {"merged": 12.0, "unexplained": 0.99 * SUBMAP_UNEXPLAINED}, None),
         (GOOD | {"merged": 12.0, "unexplained": 1.01 * SUBMAP_UNEXPLAINED}, RejectReason.UNEXPLAINED),
         (GOOD | {"merged": 1.0, "unexplained": 1.01 * SUBMAP_UNEXPLAINED}, None),

@@ -121,7 +121,7 @@ def test_a_single_thing_that_stood_elsewhere_is_no_evidence_of_a_position() -> N
 
 @pytest.mark.parametrize(("rival", "refused"), [(0.9, True), (1.1, False), (math.nan, False)])
 def test_a_pose_with_a_rival_along_the_passage_is_refused(rival: float, refused: bool) -> None:
-    assert (refuted(GOOD | {"passage_lead": rival}) is not None) == refused
+    assert (refuted(GOOD | {"lead": rival}) is not None) == refused
 
 
 def test_a_scan_of_a_single_ring_has_no_planes_and_no_rival() -> None:
@@ -160,7 +160,7 @@ def verdict_of(match: PreparedScan, query: PreparedScan, guess: Array) -> Hypoth
 def test_a_pose_that_fits_as_well_elsewhere_along_a_passage_becomes_no_closure(name: str) -> None:
     verdict = verdict_of(*PAIRS[name], np.eye(4))
     assert verdict.reason in (RejectReason.PASSAGE, RejectReason.IMPROBABLE) and verdict.closure is None
-    assert verdict.measurements["passage_lead"] < 1.0
+    assert verdict.measurements["lead"] < 1.0
 
 
 def test_in_a_passage_the_measurements_are_those_of_the_pose_that_was_taken() -> None:

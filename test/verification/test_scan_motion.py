@@ -85,6 +85,12 @@ def test_motion_that_was_not_removed_is_unknown() -> None:
     np.testing.assert_allclose(added, MODEL.unknown_motion, atol=1e-12)
 
 
+def test_unknown_motion_is_that_of_a_carrier_on_the_ground() -> None:
+    x, y, z, roll, pitch, heading = np.sqrt(np.diag(MODEL.unknown_motion))
+    assert x == y == pytest.approx(MODEL.unknown_motion_m) and z < 0.5 * x
+    assert heading == pytest.approx(np.radians(MODEL.unknown_motion_deg)) and roll == pitch < 0.5 * heading
+
+
 def test_without_scans_motion_adds_nothing() -> None:
     alignment = replace(aligned(np.random.default_rng(3))[0], pairs=np.empty((0, 2), np.intp))
     assert not motion_covariance(keyframe(None), keyframe(None), alignment, MODEL).any()

@@ -112,9 +112,14 @@ def scores(measurements: Measurements, kind: str = "") -> dict[str, float]:
 
     In a passage its positions were compared by surfaces, and no rival by points counts.
     """
-    measurements = measurements | (WITHOUT_RIVALS if "passage_lead" in measurements else {})
+    measurements = measurements | (WITHOUT_RIVALS if _in_passage(measurements) else {})
     criteria = CRITERIA[kind or kind_of(measurements)]
     return {name: criterion(measurements) for name, criterion in criteria.items()}
+
+
+def _in_passage(measurements: Measurements) -> bool:
+    """Whether the surfaces of two scans were compared along a passage, and not their points elsewhere."""
+    return "lead" in measurements and "rival_far" not in measurements
 
 
 def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
@@ -125,15 +130,15 @@ def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
     misfit = measurements["residual_m"] / measurements["noise_m"]
     if misfit > const.MAX_MISFIT:
         return RejectReason.MISFIT, f"{misfit:.0f} times"
-    if measurements.get("passage_lead", math.nan) < 1.0:
-        return RejectReason.PASSAGE, ""
+    if measurements.get("lead", math.nan) < 1.0:
+        return RejectReason.PASSAGE if _in_passage(measurements) else RejectReason.AMBIGUOUS, ""
     unexplained = measurements.get("unexplained", math.nan)
     if kind == SCAN and measurements.get("merged", 1.0) > 1 and unexplained > const.SUBMAP_UNEXPLAINED:
         return RejectReason.UNEXPLAINED, f"{unexplained:.0%}"
     correlation = measurements["terrain_correlation"]
     if kind == SUBMAP and not correlation >= const.MIN_TERRAIN:
         return RejectReason.TERRAIN, f"correlation {correlation:.2f}"
-    return (RejectReason.AMBIGUOUS, "") if measurements.get("runner_up", math.nan) < const.MIN_RUNNER_UP else None
+    return (RejectReason.AMBIGUOUS, "") if measurements.get("runner_up", math.nan) < const.MIN_LEAD else None
 
 
 @dataclass(frozen=True, slots=True)

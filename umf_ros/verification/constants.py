@@ -70,6 +70,7 @@ SCANS_KEPT = 60  # scans and submaps in memory: bounds it, changes no result
 # covariance
 SEARCH_M, SEARCH_RAD = 3.0, 0.35  # what the search itself knows, standard deviation: nothing is wider than this
 NOMINAL_INFLATION = 20.0  # by hand: a yardstick independent of data
+OFF_GROUND = 1 / 3  # by hand: of a carrier's motion, the share in height, roll and pitch
 MOMENTS = 6  # parts of a scan whose errors of motion are told apart; by hand: errors change little within a sixth
 MOTION_SHARE = 0.03  # by hand: of the motion during a scan that odometry gets wrong all along, as by its scale
 MIN_NOISE_M = 0.01  # by hand: synthetic scans have less, and no scanner is better
@@ -90,7 +91,10 @@ MAX_MISFIT = 2.5  # measured: of 2,400 right poses one in 100 has more than 1.5,
 RIVAL_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: beyond the error of a right pose, within a wrong one's
 RIVAL_FAR_M = np.concatenate([np.arange(-6.0, -0.9, 0.5), np.arange(1.0, 6.1, 0.5)])  # geometry: what repeats: doors
 RIVAL_MISFIT, MISFIT_FLOOR = 3.0, 0.05  # by hand: the worst misfit, in counterparts' reach, and what counts as none
-MIN_RUNNER_UP = 0.1  # measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 86
+# log of a ratio of misfits. measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 86. Near
+# the identity: a wrong pose in a greenhouse had .15, and of 900 right poses with it all but 8 had more than this
+MIN_LEAD, PATTERN_LEAD = 0.1, 0.2
+PATTERN_M = 1.3  # measured on validation passages: so near the identity lie wrong poses that follow the pattern
 
 # passages: corridors, tunnels, aisles, canyons, where a scan looks the same all along
 PLANE_REACH_M = 0.8  # by hand: wider neighbourhoods are no surface
@@ -105,7 +109,7 @@ PASSAGE_COMMON = 0.25  # by hand: of the compared points that a rival needs
 PASSAGE_SHIFTS_M = np.arange(-15.0, 15.1, 0.25)
 PASSAGE_RIVALS = 16  # by hand: of these poses, that are aligned
 # measured on validation passages: log of the ratio of misfits, and standard deviations, the larger near the identity
-PASSAGE_LEAD, PASSAGE_SIGMAS, PATTERN_M, PATTERN_SIGMAS = 0.12, 1.6, 1.3, 2.4
+PASSAGE_LEAD, PASSAGE_SIGMAS, PATTERN_SIGMAS = 0.12, 1.6, 2.4
 
 # temporal memory
 MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of keyframes

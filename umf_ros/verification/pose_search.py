@@ -24,7 +24,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import GridMap, Spectra, terrain_fit
 from umf_ros.verification.hypothesis import Hypothesis, same_pose
 from umf_ros.verification.keypoints import common_keypoints
-from umf_ros.verification.prepared_scan import PreparedScan, levelled, views_decide
+from umf_ros.verification.prepared_scan import PreparedScan, levelled, structured, views_decide
 from umf_ros.verification.scan_alignment import run_gicp
 from umf_ros.verification.view_alignment import PairedViews
 
@@ -93,8 +93,7 @@ def coarse_align(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
     squared = match.nearest(transform(pose, query.scouts))[1]
     near = squared < (const.SCOUT_NEAR * query.cell_m) ** 2
     terrain = terrain_fit(match.terrain, query.terrain, levelled(match, query, pose))[1]
-    structured = all(scan.map(query.cell_m).structured for scan in (match, query))
-    return Fit(pose, float(near.mean()), terrain, structured)
+    return Fit(pose, float(near.mean()), terrain, structured(match, query))
 
 
 def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:

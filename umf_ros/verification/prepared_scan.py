@@ -294,6 +294,11 @@ def views_decide(match: PreparedScan, query: PreparedScan) -> bool:
     return not (match.usable and query.usable) or (match.bare and query.bare)
 
 
+def structured(match: PreparedScan, query: PreparedScan) -> bool:
+    """Whether enough stands up from the ground around both to tell one place from another."""
+    return all(scan.map(query.cell_m).structured for scan in (match, query))
+
+
 def common_blur(match: PreparedScan, query: PreparedScan) -> float:
     """How far points of two scans may be off together because a LiDAR moved, m."""
     return max(match.blur_m, query.blur_m)

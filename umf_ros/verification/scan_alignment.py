@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import small_gicp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from umf_ros.core.frames import Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, propagate, skew, transform
@@ -25,8 +25,10 @@ class CovarianceModel:
         disorder: logarithm of one more factor on the variance where nothing overlaps, in proportion to the share of
             the points that have no counterpart: what grows, sways or hides each other misleads the others too.
         motion: factor on the standard deviation of what the odometry within a scan is measured to add.
-        unknown_motion_m: like `floor_m`, added where the motion inside a scan was not removed.
-        unknown_motion_deg: like `floor_deg`, likewise.
+        unknown_motion_m: standard deviation of horizontal translations, m, added where the motion inside a scan was not
+            removed.
+        unknown_motion_deg: of the heading, deg, likewise. A carrier moves along the ground: height, roll and pitch err
+            by a third of that.
     """
 
     inflation: float
@@ -40,16 +42,17 @@ class CovarianceModel:
     @property
     def floor(self) -> Array:
         """The floor as a covariance (6, 6), m^2 and rad^2."""
-        return _diagonal(self.floor_m, self.floor_deg)
+        return _diagonal([self.floor_m] * 3, [self.floor_deg] * 3)
 
     @property
     def unknown_motion(self) -> Array:
         """Covariance (6, 6) from motion that was not removed, m^2 and rad^2."""
-        return _diagonal(self.unknown_motion_m, self.unknown_motion_deg)
+        upward, across = np.array([1.0, 1.0, const.OFF_GROUND]), np.array([const.OFF_GROUND, const.OFF_GROUND, 1.0])
+        return _diagonal(self.unknown_motion_m * upward, self.unknown_motion_deg * across)
 
 
-def _diagonal(metres: float, degrees: float) -> Array:
-    return np.diag([metres**2] * 3 + [np.radians(degrees) ** 2] * 3)
+def _diagonal(metres: ArrayLike, degrees: ArrayLike) -> Array:
+    return np.diag(np.append(metres, np.radians(degrees)) ** 2)
 
 
 # information (6, 6) of the search itself: nothing is less known than that

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from umf_ros.core.geometry import Array, evenly, invert, near, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.pose_search import alternatives
-from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur
+from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur, structured
 from umf_ros.verification.scan_alignment import SEARCHED, run_gicp
 from umf_ros.verification.visibility import Sight, visible
 
@@ -77,7 +77,9 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     """Return how much worse the points of two scans fit at other poses, as logarithms of the ratio of the mean misfits.
 
     - `rival_near`: half a metre on, along the direction in which the position is known least;
-    - `rival_far`: at the best pose 1 to 6 m on, and at the other peaks of the search at the same heading.
+    - `rival_far`: at the best pose 1 to 6 m on, and at the other peaks of the search at the same heading;
+    - `lead`: the latter as a share of what a closure needs. Near the identity, where the patterns of two single scans
+      lie on each other wherever these were taken, that is more. Unknown in the open, where terrain decides.
 
     0 when another pose fits as well. In a passage, where points follow the sensor's pattern, `locate_along` decides.
 
@@ -94,7 +96,16 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     poses = np.stack([pose, *beside, *along, *peaks])
     misfits = _point_misfit(match, query, poses), _point_misfit(query, match, invert(poses))
     fit, far = np.log(np.maximum(sum(misfits) / 2, const.MISFIT_FLOOR)), 1 + len(beside)
-    return {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
+    found = {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
+    if not structured(match, query):
+        return found
+    single = match.merged == query.merged == 1
+    needed = const.PATTERN_LEAD if single and _near_identity(pose) else const.MIN_LEAD
+    return found | {"lead": found["rival_far"] / needed}
+
+
+def _near_identity(pose: Array) -> bool:
+    return float(np.linalg.norm(pose[:3, 3])) < const.PATTERN_M
 
 
 def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array:
@@ -172,8 +183,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     metre = np.floor(np.concatenate(points) @ way).astype(int)
     sums = np.stack([np.bincount(metre - metre.min(), row) for row in worse])
     sigmas = sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9)
-    near = np.linalg.norm(poses[first, :3, 3]) < const.PATTERN_M
-    needed = const.PATTERN_SIGMAS if near else const.PASSAGE_SIGMAS
+    needed = const.PATTERN_SIGMAS if _near_identity(poses[first]) else const.PASSAGE_SIGMAS
     ratios = (means[elsewhere] - means[first]) / const.PASSAGE_LEAD
     return PassagePosition(poses[first], float(np.minimum(ratios, sigmas / needed).min()))
 

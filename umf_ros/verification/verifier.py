@@ -182,7 +182,7 @@ class Verifier:
             return
         hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
         self._measure(hypothesis)
-        hypothesis.measurements["passage_lead"] = found.lead
+        hypothesis.measurements["lead"] = found.lead
 
     def _probability(self, hypothesis: Hypothesis) -> float:
         """That a hypothesis is right; where scans show bare ground alone, nothing would refute a texture seen twice."""

@@ -45,7 +45,7 @@ MEASUREMENTS = {
     "unexplained": "of the same, the share that is far from everything, the larger of both",
     "rival_near": "logarithm of how much worse the points fit half a metre on; unknown for improbable hypotheses",
     "rival_far": "the same of the best fit 1 to 6 m on; 0 when another pose fits as well",
-    "passage_lead": "how much worse the surfaces fit elsewhere along a passage; a closure needs 1",
+    "lead": "how much worse points, or in a passage surfaces, fit elsewhere; a closure needs 1",
     "runner_up": "logarithm of how much more is missing at the next best hypothesis about the pair",
     "pose_inliers": "feature pairs that agree with the pose",
     "residual_sigmas": "errors of reprojection in standard deviations of the features' noise",
