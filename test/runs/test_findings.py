@@ -12,9 +12,8 @@ from finished_runs import BELOW, START_NS, accepted, candidate, closure, examine
 from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, traverse, write_mcap
 
 from umf_ros.bags.inputs import Advice, useless_inputs
-from umf_ros.bags.overlay import Overlay
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.sensor_check import Disagreement, SensorReport
+from umf_ros.bags.sensor_check import Disagreement, Overlay, SensorReport
 from umf_ros.core.config import load_settings
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import ClosureReason, State

@@ -14,7 +14,6 @@ import yaml
 
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
-from umf_ros.bags.sensor_check import about_sensors
 from umf_ros.bags.storages import RawMessage, message_types
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings, load_preset, topics_of
@@ -22,6 +21,7 @@ from umf_ros.core.geometry import from_quaternion, to_quaternion
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.lab.evaluation.inspection import check_sensors
 from umf_ros.lab.simulation.bag_writer import BagWriter
+from umf_ros.runs.findings import about_sensors
 from umf_ros.sensors.decode import decode_pose
 
 Change = Callable[[str, Any], Any]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import nan
 from typing import Any
@@ -10,17 +9,15 @@ from typing import Any
 import cv2
 import numpy as np
 import small_gicp
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.bags.inputs import Advice
-from umf_ros.bags.overlay import Overlay, lay_over, overlay_equations
-from umf_ros.core.frames import Frame, Image
-from umf_ros.core.geometry import Array, invert
+from umf_ros.core.frames import Frame, Image, Points
+from umf_ros.core.geometry import Array, cubes, invert
 from umf_ros.core.trajectory import Trajectory, interpolated
 from umf_ros.embedding.depth import disparities
 
 SCAN_CELL_M, SCAN_REACH_M = 0.4, 1.0  # by hand: consecutive scans, a quarter of a metre apart
-CELL_MASK = 2**21 - 1  # three coordinates in one number: a scan is far narrower than two million cells
 MIN_SCAN_POINTS = 200  # by hand: below, consecutive scans are not registered
 CORNERS, CORNER_QUALITY, CORNER_SPACING, CORNER_WINDOW, CORNER_LEVELS = 300, 0.01, 8, (21, 21), 4  # by hand
 MIN_CORNERS = 30  # by hand: least inliers of an essential matrix
@@ -36,20 +33,10 @@ CONTRAST = 0.6  # by hand: residual at the best lag over the median one, above w
 MeasuredScan = tuple[small_gicp.PointCloud, small_gicp.KdTree, int]
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
-    """Motion between two consecutive measurements of one sensor.
-
-    Attributes:
-        start_ns, end_ns: their stamps.
-        turn: (3,) rotation vector, rad, about the body axes of the calibration.
-        shift: (3,) m in these axes, or a unit vector for a single camera, which measures no length.
-    """
-
-    start_ns: int
-    end_ns: int
-    turn: Array
-    shift: Array
+Step = tuple[tuple[int, int], Array, Array]
+"""Motion between two measurements of a sensor: their stamps in ns, (3,) rotation vector in rad and (3,) shift in m, in
+the body axes of the calibration; the shift of a single camera is a unit vector, as it measures no length."""
+_STEPS = np.dtype([("span_ns", np.int64, 2), ("turn", float, 3), ("shift", float, 3)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +67,8 @@ def as_measured(frame: Frame) -> MeasuredScan | None:
         moments = frame.motion.moments_s
         turns = Rotation.from_rotvec(-moments[:, None] * frame.motion.rates[3:])
         measured = turns.apply(frame.points - moments[:, None] * frame.motion.rates[:3]).astype(np.float32)
-        cell = np.floor(frame.points / SCAN_CELL_M).astype(np.int64) & CELL_MASK
         # the points that remain after the alignment thins them
-        thinned = np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)[1]
+        thinned = np.unique(cubes(frame.points, SCAN_CELL_M), return_index=True)[1]
         levers: Array = np.square(frame.points[thinned].astype(float)).sum(axis=1)
         mean_s = float(np.average(moments[thinned], weights=levers + 1e-9))
     cloud, tree = small_gicp.preprocess_points(measured.astype(float), SCAN_CELL_M, num_threads=1)
@@ -94,7 +80,7 @@ def scan_step(before: MeasuredScan, after: MeasuredScan) -> Step | None:
     (target, tree, start_ns), (source, _, end_ns) = before, after
     found = small_gicp.align(target, source, tree, max_correspondence_distance=SCAN_REACH_M, num_threads=1)
     turn = Rotation.from_matrix(found.T_target_source[:3, :3]).as_rotvec()
-    return Step(start_ns, end_ns, turn, found.T_target_source[:3, 3]) if found.converged else None
+    return ((start_ns, end_ns), turn, found.T_target_source[:3, 3]) if found.converged else None
 
 
 def view_step(earlier: Frame, later: Frame) -> Step | None:
@@ -114,7 +100,7 @@ def view_step(earlier: Frame, later: Frame) -> Step | None:
         return None
     mounted = earlier.body_T_camera[:3, :3]
     turned = Rotation.from_matrix(mounted @ turn.T @ mounted.T).as_rotvec()
-    return Step(earlier.image_stamp_ns, later.image_stamp_ns, turned, mounted @ (-turn.T @ shift).ravel())
+    return (earlier.image_stamp_ns, later.image_stamp_ns), turned, mounted @ (-turn.T @ shift).ravel()
 
 
 def _tracked(earlier: Image, later: Image) -> tuple[Any, Any] | None:
@@ -140,19 +126,18 @@ def compare_motion(steps: list[Step], odometry: Trajectory) -> Disagreement | No
     """
     if len(steps) < MIN_PAIRS or len(odometry) < MIN_PAIRS:
         return None
-    spans = np.array([(step.start_ns, step.end_ns) for step in steps])
-    seen_turns = np.array([step.turn for step in steps])
-    seen_ways = _directions(np.array([step.shift for step in steps]))
+    seen = np.array(steps, _STEPS)
+    seen_ways = _directions(seen["shift"])
     tried: list[tuple[float, float, Array, bool]] = []
     for lag in LAGS_S:
-        moved = spans + round(lag * 1e9)
+        moved = seen["span_ns"] + round(lag * 1e9)
         inside = (moved[:, 0] >= odometry.stamps_ns[0]) & (moved[:, 1] <= odometry.stamps_ns[-1])
         if inside.sum() < MIN_PAIRS:
             continue
         first, last = (interpolated(odometry.stamps_ns, odometry.poses, stamps) for stamps in moved[inside].T)
         stated = invert(first) @ last
         turns, ways = Rotation.from_matrix(stated[:, :3, :3]).as_rotvec(), _directions(stated[:, :3, 3])
-        rotation, residuals, known = _one_rotation(seen_turns[inside], turns, seen_ways[inside], ways)
+        rotation, residuals, known = _one_rotation(seen["turn"][inside], turns, seen_ways[inside], ways)
         tried.append((_spread(residuals), float(lag), rotation, known))
     if not tried:
         return None
@@ -200,6 +185,88 @@ def _one_rotation(turns: Array, stated: Array, ways: Array, stated_ways: Array) 
 def _directions(vectors: Array) -> Array:
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.where(length > 0.02, vectors / np.maximum(length, 1e-9), 0.0)  # zero at rest
+
+
+PLANE_POINTS, PLANE_M = 20, 0.01  # by hand: neighbours of a plane, sigma of a surface, m
+RANGE_M, PIXEL_PX = 0.02, 0.3  # by hand: sigmas of range and disparity
+OVERLAID_FRAMES = 20  # by hand: least frames
+WIDEST = np.array([*np.radians((10, 10, 10)), 0.2, 0.5])  # by hand: prior sigmas, rad, share and s
+STRIPS = 8  # by hand: vertical strips of an image
+MEDIAN_OF_NORMAL = 0.6745
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """Errors of the calibration by stereo points on LiDAR surfaces, with their standard deviations.
+
+    Attributes:
+        turn_deg: (3,) rotation vector that corrects `body_T_lidar`, body axes.
+        scale: depth of stereo over that of the LiDAR.
+        lag_s: correction of the LiDAR's stamps to the camera's clock.
+        deviations: (3,) standard deviations of turn (deg, largest axis), scale, and lag (s).
+    """
+
+    turn_deg: Array
+    scale: float
+    lag_s: float
+    deviations: Array
+
+
+def overlay_equations(frame: Frame, disparity: Array, pixels: Array, chosen: NDArray[np.intp]) -> Array:
+    """Return equations (M, 7) of a frame: derivatives by turn (3, rad), stereo scale and lag (s), residual, and strip.
+
+    A stereo point must lie in the plane around the LiDAR point at its pixel. Each row is divided by the standard
+    deviation of this distance; the last column is the vertical strip of the image.
+
+    Args:
+        frame: with points and motion.
+        disparity: (M,) px.
+        pixels: (M, 2) of the left image.
+        chosen: (M,) rows of the scan's points at these pixels.
+    """
+    assert frame.points is not None
+    camera, cloud = frame.camera, frame.points.astype(float)
+    points, tree = cloud[chosen], small_gicp.KdTree(cloud)
+    around = cloud[np.asarray(tree.batch_knn_search(points, PLANE_POINTS)[0], np.intp)]
+    around -= around.mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(around.swapaxes(1, 2) @ around)[1][:, :, 0]
+    across, down = (pixels - (camera.cx, camera.cy)).T / camera.fx
+    rays = np.column_stack([across, down, np.ones(len(pixels))]) @ frame.body_T_camera[:3, :3].T
+    depth = (points - frame.body_T_camera[:3, 3]) @ frame.body_T_camera[:3, 2]
+    pixel_m = depth**2 / (camera.fx * camera.baseline)
+    nearer = pixel_m * (disparity - camera.fx * camera.baseline / depth)  # linear in the disparity, so unbiased
+    rates = np.zeros(6) if frame.motion is None else frame.motion.rates
+    moved = rates[:3] + np.cross(rates[3:], points)
+    levers = np.cross(points - frame.body_T_lidar[:3, 3], normals)
+    facing, slip = (np.einsum("ij,ij->i", normals, one) for one in (rays, moved))
+    deviation = np.hypot(PLANE_M, facing * np.hypot(RANGE_M, PIXEL_PX * pixel_m))
+    rows = np.column_stack([-levers, facing * depth, -slip, facing * nearer])
+    return np.column_stack([rows / deviation[:, None], pixels[:, 0] * STRIPS // camera.width])
+
+
+def lay_over(equations: list[Array]) -> Overlay | None:
+    """Solve the equations of many frames robustly; return None for too few frames.
+
+    The standard deviations are those between frames and between strips of the image, within which errors are correlated
+    (cluster-robust). They are enlarged if the residuals exceed the assumed noise.
+    """
+    if len(equations) < OVERLAID_FRAMES:
+        return None
+    rows, left, strips = np.split(np.concatenate(equations), (5, 6), axis=1)
+    frames = np.repeat(np.arange(len(equations)), [len(part) for part in equations])
+    known, weights, spread = np.diag(np.square(1 / WIDEST)), np.ones((len(rows), 1)), np.zeros((5, 5))
+    for _ in range(ROUNDS):
+        spread = np.linalg.inv((rows * weights).T @ rows + known)
+        found = spread @ (rows * weights).T @ left
+        remaining = left - rows @ found
+        weights = 1 / (1 + (remaining / (3 * np.median(np.abs(remaining)))) ** 2)
+    deviations = np.zeros(5)
+    for labels in (frames, strips[:, 0]):
+        pulls = np.stack([(rows * weights * remaining)[labels == one].sum(axis=0) for one in np.unique(labels)])
+        deviations = np.maximum(deviations, np.sqrt(np.diag(spread @ (pulls.T @ pulls + known) @ spread)))
+    deviations *= max(1.0, float(np.median(np.abs(remaining))) / MEDIAN_OF_NORMAL)
+    told = np.array([np.degrees(deviations[:3].max()), *deviations[3:]])
+    return Overlay(np.degrees(found[:3, 0]), float(1 / (1 + found[3, 0])), float(found[4, 0]), told)
 
 
 MIN_STEP_S, MAX_STEP_S = 0.18, 1.0  # by hand: between frames whose motion is compared
@@ -324,109 +391,3 @@ def _forward(odometry: Trajectory) -> Array | None:
 
 def _median(values: list[float]) -> float:
     return float(np.median(values)) if values else nan
-
-
-BLANK, DIM = 3.0, 8.0
-"""Grey values, by hand: largest standard deviations of an empty image, and of one with little contrast."""
-FEW_RETURNS = 500
-"""By hand: largest number of returns of a scan that is too sparse for place recognition."""
-LAG_S = 0.1
-"""By hand: least lag that is reported, twice the step of the search."""
-MOUNTING_DEG = 6.0
-"""Least rotation that is reported (*measured* on simulated drives: errors of right mountings reach 3.3 deg, the largest
-about the vertical)."""
-FINE_DEG, FINE_SCALE, FINE_S = 0.5, 0.006, 0.01
-"""Least errors by stereo that are reported (*measured* on simulated drives: those of right calibrations reach half)."""
-SURE = 3.0
-"""By hand: least standard deviations of an error by stereo that is reported."""
-SAME_DEG = 5.0
-"""By hand: largest difference of two sensors' rotations that is attributed to the odometry."""
-ACROSS = 0.5
-"""By hand: least share of the motion along z for which the odometry is not that of the body."""
-_SENSORS = {"lidar": "LiDAR", "camera": "camera"}
-
-
-def about_sensors(seen: SensorReport) -> Iterator[Advice]:
-    """Yield findings about exposure, returns, baseline, clocks and mountings."""
-    yield from _measurements(seen)
-    if seen.forward is not None and abs(seen.forward[2]) >= max(ACROSS, np.abs(seen.forward[:2]).max()):
-        what = "the odometry is not that of the body: it moves along the body's z axis, which is up"
-        remedy = "name the frame of the poses: --odometry-frame camera (z forward), imu or lidar"
-        yield Advice("fault", what, remedy)
-    known = {name: one for name in _SENSORS if (one := getattr(seen, name)) is not None}
-    by_motion = [*_clocks({name: one.lag_s for name, one in known.items()})]
-    by_motion += _mountings({name: one.mounting_deg for name, one in known.items() if one.mounting_deg is not None})
-    yield from by_motion
-    if seen.overlay is not None:
-        yield from _overlaid(seen.overlay, bool(by_motion))
-
-
-def _overlaid(overlay: Overlay, is_known: bool) -> Iterator[Advice]:
-    """Yield the largest error by its limit, as it causes apparent errors of the others; unless it `is_known`."""
-    turn, scale, units = overlay.turn_deg, overlay.scale, np.array([FINE_DEG, FINE_SCALE, FINE_S])
-    sizes = np.abs(np.array([float(np.linalg.norm(turn)), scale - 1, overlay.lag_s])) / units
-    bounds, worst = SURE * overlay.deviations / units, int(sizes.argmax())
-    seen = "by stereo and LiDAR on the same surfaces"
-    if sizes[worst] <= max(bounds[worst], 1):
-        pass
-    elif worst == 1:
-        what = f"stereo depth is {scale:.3g} times that of the LiDAR: the baseline is wrong by this factor"
-        remedy = f"divide the baseline of the calibration, or P[3] of the right camera_info, by {scale:.3f}"
-        yield Advice("fault", what, remedy)
-    elif worst == 0 and not is_known:
-        what = f"{seen}, the mounting is wrong: rotating the LiDAR by {_turn(turn)} corrects it"
-        yield Advice("warning", what, "correct body_T_lidar or body_T_camera of the calibration")
-    elif not is_known:
-        what = f"{seen}, the LiDAR's clock is about {-overlay.lag_s:+.3f} s off the camera's"
-        yield Advice("warning", what, "correct the stamps in the drivers (PTP, or a constant): no parameter does")
-    for bound, name in zip(bounds, ("mounting to 1 deg", "baseline to 1 %", "clock to 20 ms"), strict=True):
-        if bound > 2:
-            what = f"the recording does not determine the {name}"
-            yield Advice("note", what, "record a longer drive with turns past rocks")
-
-
-def _measurements(seen: SensorReport) -> Iterator[Advice]:
-    for name, contrast in (("left", seen.left_contrast), ("right", seen.right_contrast)):
-        vary = f"the median standard deviation of grey values is {contrast:.1f}"
-        if contrast < BLANK:
-            remedy = f"check that the camera is not covered, and topics.{name}_image"
-            yield Advice("fault", f"the {name} images are empty: {vary}", remedy)
-        elif contrast < DIM:
-            yield Advice("warning", f"the {name} images have little contrast: {vary}", "correct exposure and gain")
-    if seen.returns < FEW_RETURNS:
-        remedy = "a place needs some thousands: merge scans, or check min_intensity and max_height_m of the calibration"
-        yield Advice("warning", f"scans have {seen.returns:.0f} returns in the median", remedy)
-    if seen.intensity_max == 0:
-        yield Advice("warning", "all intensities are 0, so the descriptor has none", "publish a field named intensity")
-
-
-def _clocks(lags: dict[str, float]) -> Iterator[Advice]:
-    off = {name: lag for name, lag in lags.items() if abs(lag) >= LAG_S}
-    if off and len(lags) == 2 and abs(lags["lidar"] - lags["camera"]) < LAG_S:
-        what = f"the odometry's clock is about {lags['lidar']:+.1f} s off those of camera and LiDAR"
-        yield Advice("fault", what, "correct its stamps: frames take their poses from it")
-        return
-    for name, lag in off.items():
-        what = f"the {_SENSORS[name]}'s clock is about {-lag:+.1f} s off the odometry's, by its motion"
-        yield Advice("fault", what, "correct the stamps in its driver (PTP, or a constant): no parameter does")
-
-
-def _mountings(known: dict[str, Array]) -> Iterator[Advice]:
-    off = {name: turn for name, turn in known.items() if np.linalg.norm(turn) > MOUNTING_DEG}
-    if len(off) == 2 and np.linalg.norm(off["lidar"] - off["camera"]) < SAME_DEG:
-        turned = _turn(off["lidar"])
-        what = f"the odometry is not that of the body: by camera and LiDAR it is rotated by {turned}"
-        remedy = "name the frame of the poses (--odometry-frame camera, imu or lidar); a topic must be that of the body"
-        yield Advice("fault", what, remedy)
-        return
-    for name, turn in off.items():
-        what = f"the {_SENSORS[name]}'s mounting is off by {_turn(turn)}, by its motion and the odometry"
-        yield Advice("fault", what, f"correct body_T_{name} of the calibration")
-
-
-def _turn(mounting_deg: Array) -> str:
-    """Return a rotation in words, such as "10 deg, mostly about y"."""
-    axis = int(np.abs(mounting_deg).argmax())
-    digits = 0 if np.linalg.norm(mounting_deg) > SAME_DEG else 1
-    size, along = np.linalg.norm(mounting_deg), mounting_deg[axis]
-    return f"{size:.{digits}f} deg, mostly about {'xyz'[axis]} ({along:+.{digits}f} deg)"

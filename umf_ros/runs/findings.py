@@ -12,8 +12,9 @@ import numpy as np
 
 from umf_ros.absolute.measurement import read_verdict_counts
 from umf_ros.bags.inputs import SEVERITIES, Advice, Severity, absent_inputs, useless_inputs
-from umf_ros.bags.sensor_check import about_sensors
+from umf_ros.bags.sensor_check import Overlay, SensorReport
 from umf_ros.core.config import Settings
+from umf_ros.core.geometry import Array
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, explain
 from umf_ros.runs.truth import JudgedRun, in_words
@@ -223,6 +224,112 @@ def _speed(about: JudgedRun) -> Iterator[Advice]:
 def _end(about: JudgedRun) -> Iterator[Advice]:
     if about.run.summary.get("interrupted"):
         yield Advice("note", "the run was interrupted: results cover the part before")
+
+
+BLANK, DIM = 3.0, 8.0
+"""Grey values, by hand: largest standard deviations of an empty image, and of one with little contrast."""
+FEW_RETURNS = 500
+"""By hand: largest number of returns of a scan that is too sparse for place recognition."""
+LAG_S = 0.1
+"""By hand: least lag that is reported, twice the step of the search."""
+MOUNTING_DEG = 6.0
+"""Least rotation that is reported (*measured* on simulated drives: errors of right mountings reach 3.3 deg, the largest
+about the vertical)."""
+FINE_DEG, FINE_SCALE, FINE_S = 0.5, 0.006, 0.01
+"""Least errors by stereo that are reported (*measured* on simulated drives: those of right calibrations reach half)."""
+SURE = 3.0
+"""By hand: least standard deviations of an error by stereo that is reported."""
+SAME_DEG = 5.0
+"""By hand: largest difference of two sensors' rotations that is attributed to the odometry."""
+ACROSS = 0.5
+"""By hand: least share of the motion along z for which the odometry is not that of the body."""
+_SENSORS = {"lidar": "LiDAR", "camera": "camera"}
+
+
+def about_sensors(seen: SensorReport) -> Iterator[Advice]:
+    """Yield findings about exposure, returns, baseline, clocks and mountings."""
+    yield from _measurements(seen)
+    if seen.forward is not None and abs(seen.forward[2]) >= max(ACROSS, np.abs(seen.forward[:2]).max()):
+        what = "the odometry is not that of the body: it moves along the body's z axis, which is up"
+        remedy = "name the frame of the poses: --odometry-frame camera (z forward), imu or lidar"
+        yield Advice("fault", what, remedy)
+    known = {name: one for name in _SENSORS if (one := getattr(seen, name)) is not None}
+    by_motion = [*_clocks({name: one.lag_s for name, one in known.items()})]
+    by_motion += _mountings({name: one.mounting_deg for name, one in known.items() if one.mounting_deg is not None})
+    yield from by_motion
+    if seen.overlay is not None:
+        yield from _overlaid(seen.overlay, bool(by_motion))
+
+
+def _overlaid(overlay: Overlay, is_known: bool) -> Iterator[Advice]:
+    """Yield the largest error by its limit, as it causes apparent errors of the others; unless it `is_known`."""
+    turn, scale, units = overlay.turn_deg, overlay.scale, np.array([FINE_DEG, FINE_SCALE, FINE_S])
+    sizes = np.abs(np.array([float(np.linalg.norm(turn)), scale - 1, overlay.lag_s])) / units
+    bounds, worst = SURE * overlay.deviations / units, int(sizes.argmax())
+    seen = "by stereo and LiDAR on the same surfaces"
+    if sizes[worst] <= max(bounds[worst], 1):
+        pass
+    elif worst == 1:
+        what = f"stereo depth is {scale:.3g} times that of the LiDAR: the baseline is wrong by this factor"
+        remedy = f"divide the baseline of the calibration, or P[3] of the right camera_info, by {scale:.3f}"
+        yield Advice("fault", what, remedy)
+    elif worst == 0 and not is_known:
+        what = f"{seen}, the mounting is wrong: rotating the LiDAR by {_turn(turn)} corrects it"
+        yield Advice("warning", what, "correct body_T_lidar or body_T_camera of the calibration")
+    elif not is_known:
+        what = f"{seen}, the LiDAR's clock is about {-overlay.lag_s:+.3f} s off the camera's"
+        yield Advice("warning", what, "correct the stamps in the drivers (PTP, or a constant): no parameter does")
+    for bound, name in zip(bounds, ("mounting to 1 deg", "baseline to 1 %", "clock to 20 ms"), strict=True):
+        if bound > 2:
+            what = f"the recording does not determine the {name}"
+            yield Advice("note", what, "record a longer drive with turns past rocks")
+
+
+def _measurements(seen: SensorReport) -> Iterator[Advice]:
+    for name, contrast in (("left", seen.left_contrast), ("right", seen.right_contrast)):
+        vary = f"the median standard deviation of grey values is {contrast:.1f}"
+        if contrast < BLANK:
+            remedy = f"check that the camera is not covered, and topics.{name}_image"
+            yield Advice("fault", f"the {name} images are empty: {vary}", remedy)
+        elif contrast < DIM:
+            yield Advice("warning", f"the {name} images have little contrast: {vary}", "correct exposure and gain")
+    if seen.returns < FEW_RETURNS:
+        remedy = "a place needs some thousands: merge scans, or check min_intensity and max_height_m of the calibration"
+        yield Advice("warning", f"scans have {seen.returns:.0f} returns in the median", remedy)
+    if seen.intensity_max == 0:
+        yield Advice("warning", "all intensities are 0, so the descriptor has none", "publish a field named intensity")
+
+
+def _clocks(lags: dict[str, float]) -> Iterator[Advice]:
+    off = {name: lag for name, lag in lags.items() if abs(lag) >= LAG_S}
+    if off and len(lags) == 2 and abs(lags["lidar"] - lags["camera"]) < LAG_S:
+        what = f"the odometry's clock is about {lags['lidar']:+.1f} s off those of camera and LiDAR"
+        yield Advice("fault", what, "correct its stamps: frames take their poses from it")
+        return
+    for name, lag in off.items():
+        what = f"the {_SENSORS[name]}'s clock is about {-lag:+.1f} s off the odometry's, by its motion"
+        yield Advice("fault", what, "correct the stamps in its driver (PTP, or a constant): no parameter does")
+
+
+def _mountings(known: dict[str, Array]) -> Iterator[Advice]:
+    off = {name: turn for name, turn in known.items() if np.linalg.norm(turn) > MOUNTING_DEG}
+    if len(off) == 2 and np.linalg.norm(off["lidar"] - off["camera"]) < SAME_DEG:
+        turned = _turn(off["lidar"])
+        what = f"the odometry is not that of the body: by camera and LiDAR it is rotated by {turned}"
+        remedy = "name the frame of the poses (--odometry-frame camera, imu or lidar); a topic must be that of the body"
+        yield Advice("fault", what, remedy)
+        return
+    for name, turn in off.items():
+        what = f"the {_SENSORS[name]}'s mounting is off by {_turn(turn)}, by its motion and the odometry"
+        yield Advice("fault", what, f"correct body_T_{name} of the calibration")
+
+
+def _turn(mounting_deg: Array) -> str:
+    """Return a rotation in words, such as "10 deg, mostly about y"."""
+    axis = int(np.abs(mounting_deg).argmax())
+    digits = 0 if np.linalg.norm(mounting_deg) > SAME_DEG else 1
+    size, along = np.linalg.norm(mounting_deg), mounting_deg[axis]
+    return f"{size:.{digits}f} deg, mostly about {'xyz'[axis]} ({along:+.{digits}f} deg)"
 
 
 _CAUSES = (_truth, _gaps, lambda about: about_sensors(about.sensors), _disparity, _pairs, _inputs)

@@ -36,12 +36,12 @@ def command(
 
     from umf_ros.bags.presets import settings_for
     from umf_ros.bags.reader import open_bag
-    from umf_ros.bags.sensor_check import about_sensors
     from umf_ros.core.io import check_writable, create_run_folder, write_atomically
     from umf_ros.lab.commands import simulate
     from umf_ros.lab.evaluation.inspection import check_sensors
     from umf_ros.lab.evaluation.results import print_table
     from umf_ros.lab.evaluation.sensors_run import replay_all, score, stretches_of, table_of
+    from umf_ros.runs.findings import about_sensors
 
     console = Console()
     check_writable(out)
