@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from umf_ros.lab.scan_files import parse_pcd, parse_ply
 from umf_ros.maps.outputs import CLOUD, thickness, thin, write_points
-from umf_ros.runs.gallery import HeightMap
+from umf_ros.runs.scene import HeightMap
 
 
 def ground(offset_m: float, noise_m: float = 0.01) -> NDArray[np.void]:

@@ -13,7 +13,6 @@ import pytest
 from finished_runs import BELOW, accepted, candidate, closure, examined, trajectory
 
 from umf_ros.runs.findings import conclude, look_first
-from umf_ros.runs.gallery import Gallery
 from umf_ros.runs.report import write_page
 from umf_ros.runs.run_file import SCAN_UNIT_M, Picture
 from umf_ros.runs.scene import build_scene, pairs_of
@@ -36,10 +35,10 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     grey = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
     jpeg = cv2.imencode(".jpg", grey)[1].tobytes()
     scan = (np.random.default_rng(1).uniform(-10, 10, (50, 3)) / SCAN_UNIT_M).astype(np.int16)
-    gallery = Gallery({int(stamp): Picture(int(stamp), jpeg, 64, 48, scan) for stamp in about.run.stamps})
+    pictures = {int(stamp): Picture(int(stamp), jpeg, 64, 48, scan) for stamp in about.run.stamps}
     findings = look_first(about)
     inliers = {(closures[0].query_stamp_ns, closures[0].match_stamp_ns): np.array([[3.0, 4, 30, 20]])}
-    write_page(about, conclude(about, findings), findings, build_scene(about, pairs_of(about), gallery, inliers))
+    write_page(about, conclude(about, findings), findings, build_scene(about, pairs_of(about), pictures, inliers))
     return folder / "report.html"
 
 

@@ -17,7 +17,6 @@ from support.judged import judge_closure
 from umf_ros.bags.inputs import Advice
 from umf_ros.pose_graph.closures import ClosureReason, State
 from umf_ros.runs.findings import conclude, look_first
-from umf_ros.runs.gallery import Gallery
 from umf_ros.runs.report import closure_rows, describe, final_verdicts, print_summary, write_page
 from umf_ros.runs.scene import build_scene, pairs_of
 from umf_ros.runs.truth import JudgedRun
@@ -52,7 +51,7 @@ class Read(HTMLParser):
 
 def written(about: JudgedRun, findings: list[Advice] | None = None) -> str:
     findings = look_first(about) if findings is None else findings
-    scene = build_scene(about, pairs_of(about), Gallery(), {})
+    scene = build_scene(about, pairs_of(about), {}, {})
     write_page(about, conclude(about, findings), findings, scene)
     return (about.run.folder / "report.html").read_text(encoding="utf-8")
 

@@ -26,8 +26,8 @@ from umf_ros.maps.map_folder import MapFolder
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import stored_identity
 from umf_ros.pose_graph.closures import State, verdict_table
-from umf_ros.runs.gallery import HeightMap, data_address
 from umf_ros.runs.report import plot_trajectories, render
+from umf_ros.runs.scene import HeightMap, data_address
 from umf_ros.terrain.grid import write_terrain
 from umf_ros.terrain.voxels import REACH_M, PlacedScan, VoxelMap
 

@@ -31,10 +31,19 @@ from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import write_atomically
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.findings import RunVerdict, conclude, look_first
-from umf_ros.runs.gallery import Gallery, read_gallery
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import Endpoints, read_inliers
-from umf_ros.runs.scene import build_scene, by_need, drawn_trajectory, named_curves, pairs_of, size_of
+from umf_ros.runs.scene import (
+    Pictures,
+    build_scene,
+    by_need,
+    drawn_trajectory,
+    named_curves,
+    pairs_of,
+    photograph,
+    read_pictures,
+    size_of,
+)
 from umf_ros.runs.truth import MEDIAN_EXPECTED, Judged, JudgedRun, in_words, judge_run
 from umf_ros.runs.writer import write_summary
 
@@ -282,11 +291,11 @@ def finish_run(
         rows = evenly(len(run.closures), MAX_PICTURES)
         chosen = [run.closures[row] for row in rows]
         drawn = {*shown, *(stamp for one in chosen for stamp in one.endpoints)}
-        gallery = read_gallery(run.folder, drawn, drawn_trajectory(about))
-        _draw_matches(about, chosen, gallery, inliers)
+        pictures, heights = read_pictures(run.folder, drawn, drawn_trajectory(about))
+        _draw_matches(about, chosen, pictures, inliers)
         findings = look_first(about)
         verdict = conclude(about, findings)
-        write_page(about, verdict, findings, build_scene(about, pairs, gallery, inliers))
+        write_page(about, verdict, findings, build_scene(about, pairs, pictures, inliers, heights))
     print_summary(console, about, verdict, findings, printed)
     return verdict
 
@@ -326,7 +335,7 @@ def draw_trajectory(about: JudgedRun) -> None:
 
 
 def _draw_matches(
-    about: JudgedRun, chosen: list[LoopClosure], gallery: Gallery, inliers: dict[Endpoints, Array]
+    about: JudgedRun, chosen: list[LoopClosure], pictures: Pictures, inliers: dict[Endpoints, Array]
 ) -> None:
     """Write matches/*.png for closures spread over the run."""
     target = about.run.folder / "matches"
@@ -334,7 +343,7 @@ def _draw_matches(
 
     def draw(closure: LoopClosure) -> None:
         key = closure.endpoints
-        query, match = (gallery.image(stamp) for stamp in key)
+        query, match = (photograph(pictures.get(stamp)) for stamp in key)
         if query is not None and match is not None:
             lines = inliers.get(key, np.empty((0, 4)))
             picture = draw_match(query, match, lines, describe(closure, len(lines), about.by_endpoints.get(key)))

@@ -1,22 +1,25 @@
-"""Data of the report: trajectories, closures and pairs."""
+"""Data of the report: trajectories, closures, pairs and pictures."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Container, Iterable, Mapping
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
-from umf_ros.core.frames import Points
-from umf_ros.core.geometry import Array, evenly, relative, rotation_angle
+from umf_ros.core.frames import Image, Points
+from umf_ros.core.geometry import Array, evenly, relative, rotation_angle, transform
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, contributions, explain, missing, most_probable
 from umf_ros.runs.findings import explain_missed
-from umf_ros.runs.gallery import Gallery, data_address
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.run_file import SCAN_UNIT_M, Endpoints
+from umf_ros.runs.run_file import NAME, SCAN_UNIT_M, Endpoints, Picture, RunFile
 from umf_ros.runs.truth import JudgedRun, pose_in_truth, positions_in_truth
 from umf_ros.verification.hypothesis import Hypothesis
 
@@ -28,6 +31,8 @@ Photograph = tuple[str, int, int]
 """A reduced image: a `data:` address, and width and height in pixels of the image that it was made from."""
 Pairs = dict[Endpoints, dict[str, Any]]
 """Entries of the page about pairs of keyframes, by their stamps."""
+Pictures = Mapping[int, Picture]
+"""Pictures of keyframes by their stamps."""
 
 
 def pairs_of(about: JudgedRun) -> Pairs:
@@ -150,6 +155,89 @@ def _number(value: float | None) -> float | None:
     return None if value is None or not np.isfinite(value) else round(float(value), 4)
 
 
+MAP_CELLS, MAP_REACH_M = 700, 25.0  # by hand: bounds the picture
+SHOWN_POINTS = 600  # by hand: of a scan, enough to see the ground
+
+
+class HeightMap:
+    """Mean heights around a path.
+
+    Attributes:
+        lower, upper: (2,) x and y of its lower left and upper right corner, m.
+    """
+
+    def __init__(self, path: Array) -> None:
+        """Make an empty map around the (N, 2) positions of a path, N > 0."""
+        self.lower = path.min(axis=0) - MAP_REACH_M
+        span = path.max(axis=0) + MAP_REACH_M - self.lower
+        self._cell = max(0.1, float(span.max()) / MAP_CELLS)
+        self._shape = tuple(math.ceil(side / self._cell) for side in span)
+        self._sum, self._count = np.zeros(self._shape), np.zeros(self._shape, np.int32)
+        self.upper = self.lower + np.array(self._shape) * self._cell
+
+    def add(self, points: Array) -> None:
+        """Add (N, 3) points in the map's frame."""
+        column, row = np.floor((points[:, :2] - self.lower) / self._cell).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (column < self._shape[0]) & (row < self._shape[1])
+        np.add.at(self._sum, (column[inside], row[inside]), points[inside, 2])
+        np.add.at(self._count, (column[inside], row[inside]), 1)
+
+    def png(self) -> bytes | None:
+        """Return heights as colours and relief as light from the north-west, blank where unknown; None if empty."""
+        seen = self._count > 0
+        if not seen.any():
+            return None
+        height: Array = np.where(seen, self._sum / np.maximum(self._count, 1), 0.0)
+        low, high = np.percentile(height[seen], [2, 98])
+        share = np.clip((height - low) / max(high - low, 0.1), 0, 1)
+        colours = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+        slope = np.gradient(height, self._cell)
+        light = np.clip(0.85 + 0.6 * (slope[0] - slope[1]), 0.4, 1.15)
+        shaded = np.clip(colours * light[..., None], 0, 255).astype(np.uint8)
+        pixels = np.dstack([shaded, np.where(seen, 255, 0).astype(np.uint8)])
+        # columns of the array are y: a picture has y upwards along its rows
+        _, data = cv2.imencode(".png", np.ascontiguousarray(np.swapaxes(pixels, 0, 1)[::-1]))
+        return data.tobytes()
+
+
+def read_pictures(
+    folder: Path, shown: Container[int], drawn: Trajectory | None
+) -> tuple[dict[int, Picture], HeightMap | None]:
+    """Return the pictures of a run whose stamps are `shown`, and its scans along a trajectory as a map from above."""
+    pictures: dict[int, Picture] = {}
+    heights = HeightMap(drawn.poses[:, :2, 3]) if drawn is not None and len(drawn) else None
+    if not (folder / NAME).is_file():  # of an earlier release
+        return pictures, heights
+    with closing(RunFile(folder, read_only=True)) as file:
+        for picture in file.pictures():
+            if picture.stamp_ns in shown:
+                pictures[picture.stamp_ns] = picture
+            if drawn is not None and heights is not None:
+                poses, known = drawn.at(np.array([picture.stamp_ns], np.int64))
+                points = picture.scan * SCAN_UNIT_M
+                near = points[np.linalg.norm(points, axis=1) < MAP_REACH_M]
+                if known[0]:
+                    heights.add(transform(poses[0], near))
+    return pictures, heights
+
+
+def photograph(picture: Picture | None) -> Image | None:
+    """Return the left image (H, W) of a keyframe in its size, without the detail that was reduced; None without one."""
+    if picture is None or not picture.jpeg:
+        return None
+    reduced: Any = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return cv2.resize(reduced, (picture.width, picture.height), interpolation=cv2.INTER_CUBIC)
+
+
+def data_address(kind: str, content: bytes) -> str:
+    """Return the content inside an address."""
+    return f"data:{kind};base64,{_base64(content)}"
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")
+
+
 MAX_POINTS = 3000
 """Most points of a curve."""
 MAX_SIDE = 300
@@ -168,10 +256,16 @@ def drawn_trajectory(about: JudgedRun) -> Trajectory | None:
     return Trajectory(best.stamps_ns, pose_in_truth(best, run.truth) @ best.poses, best.has_orientation)
 
 
-def build_scene(about: JudgedRun, pairs: Pairs, gallery: Gallery, inliers: Mapping[Endpoints, Array]) -> dict[str, Any]:
+def build_scene(
+    about: JudgedRun,
+    pairs: Pairs,
+    pictures: Pictures,
+    inliers: Mapping[Endpoints, Array],
+    heights: HeightMap | None = None,
+) -> dict[str, Any]:
     """Return the scene: curves, keyframes, pairs with their pictures, matrix, threshold, errors and map."""
     chosen = by_need(pairs)
-    photographs, scans = _media(chosen, gallery)
+    photographs, scans = _media(chosen, pictures)
     for key in chosen:
         pairs[key] |= _details(about, key, pairs[key]["number"])
     for key, lines in inliers.items():
@@ -189,20 +283,31 @@ def build_scene(about: JudgedRun, pairs: Pairs, gallery: Gallery, inliers: Mappi
         "threshold": about.run.settings.verification.min_probability,
         "sweep": _sweep(about),
         "errors": error_curves(about.run) or None,
-        "map": gallery.map_picture(),
+        "map": _map_picture(heights),
     }
 
 
-def _media(pairs: Iterable[Endpoints], gallery: Gallery) -> tuple[dict[str, Photograph], dict[str, str]]:
-    """Return the photographs and scans by stamp, of the most informative pairs first, as many as fit."""
+def _map_picture(heights: HeightMap | None) -> dict[str, Any] | None:
+    """Return the map: `data:` address, (x, y) in m of `lower` left and `upper` right corner; None if empty."""
+    png = heights.png() if heights is not None else None
+    if heights is None or png is None:
+        return None
+    return {"address": data_address("image/png", png), "lower": heights.lower.tolist(), "upper": heights.upper.tolist()}
+
+
+def _media(pairs: Iterable[Endpoints], pictures: Pictures) -> tuple[dict[str, Photograph], dict[str, str]]:
+    """Return the photographs and scans by stamp, of the most informative pairs first, as many as fit.
+
+    A scan is base64 of some of its points: little-endian int16 triples in `SCAN_UNIT_M`, body frame.
+    """
     room = MEDIA_BYTES
     photographs: dict[str, Photograph] = {}
     scans: dict[str, str] = {}
     for stamp in dict.fromkeys(stamp for key in pairs for stamp in key):
-        if (picture := gallery.pictures.get(stamp)) is None:
+        if (picture := pictures.get(stamp)) is None:
             continue
         address = data_address("image/jpeg", picture.jpeg) if picture.jpeg else ""
-        scan = gallery.scan(stamp)
+        scan = _base64(picture.scan[evenly(len(picture.scan), SHOWN_POINTS)].astype("<i2").tobytes())
         if len(address) + len(scan) <= room:
             room -= len(address) + len(scan)
             scans[str(stamp)] = scan
@@ -250,7 +355,7 @@ def _similarity(descriptors: Points | None) -> dict[str, Any] | None:
         return None
     rows = evenly(len(descriptors), MAX_SIDE)
     matrix = np.clip(np.rint(100 * descriptors[rows] @ descriptors[rows].T), -100, 100).astype("<i1")
-    return {"rows": rows.tolist(), "data": base64.b64encode(matrix.tobytes()).decode("ascii")}
+    return {"rows": rows.tolist(), "data": _base64(matrix.tobytes())}
 
 
 def _sweep(about: JudgedRun) -> list[list[float | int]]:
