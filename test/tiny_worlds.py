@@ -12,8 +12,7 @@ from umf_ros.core.geometry import make_pose
 from umf_ros.embedding.inputs import pack, prepare_scan
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.datasets.views import View, ViewMaker
-from umf_ros.networks.config import NetworkConfig
-from umf_ros.networks.umf import NetworkInput
+from umf_ros.networks.config import NetworkConfig, NetworkInput
 
 TINY = NetworkConfig(
     width=8,
@@ -44,11 +43,11 @@ def some_scan(seed: int, count: int = 2000) -> np.ndarray:
     return np.column_stack([x, y, np.sin(x / 5 + seed) + np.cos(y / 4)]).astype(np.float32)
 
 
-def some_input(config: NetworkConfig = TINY, count: int = 2, trim: bool = False) -> NetworkInput:
+def some_input(config: NetworkConfig = TINY, count: int = 2) -> NetworkInput:
     rng = np.random.default_rng(5)
     images = [rng.normal(size=config.image_size).astype(np.float32) for _ in range(count)]
     scans = [prepare_scan(some_scan(seed), None, config) for seed in range(count)]
-    return NetworkInput.of(pack(images, scans, config, trim))
+    return pack(images, scans, config).tensors()
 
 
 def pose_at(x: float, y: float, yaw_deg: float = 0.0) -> np.ndarray:

@@ -22,6 +22,7 @@ from umf_ros.embedding.inputs import (
     voxelise,
 )
 from umf_ros.embedding.umf import cell_regions, ground_regions, select_salient
+from umf_ros.lab.training.batches import trimmed
 
 
 def voxels_of(points: np.ndarray) -> dict[tuple[int, int, int], list[int]]:
@@ -115,12 +116,13 @@ def test_a_batch_says_what_is_missing():
 @pytest.mark.parametrize("counts", [(30, 60), (0, 0)], ids=["short", "empty"])
 def test_only_padding_is_trimmed(counts):
     scans = [prepare_scan(some_scan(row, count), None, TINY) for row, count in enumerate(counts)]
-    whole, trimmed = (pack([None, None], scans, TINY, trim) for trim in (False, True))
+    whole = pack([None, None], scans, TINY)
+    short = trimmed(whole)
     assert whole.fine_index.shape == (2, TINY.fine_voxels)
     longest = max(1, int(whole.fine_mask.sum(1).max()))
-    assert trimmed.fine_index.shape == trimmed.fine_mask.shape == (2, longest)
-    assert np.array_equal(whole.fine_index[:, :longest], trimmed.fine_index)
-    assert trimmed.coarse_mask.sum() == whole.coarse_mask.sum()
+    assert short.fine_index.shape == short.fine_mask.shape == (2, longest)
+    assert np.array_equal(whole.fine_index[:, :longest], short.fine_index)
+    assert short.coarse_mask.sum() == whole.coarse_mask.sum()
 
 
 def test_a_blank_input_has_the_shapes_of_any_other():

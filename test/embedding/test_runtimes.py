@@ -31,7 +31,7 @@ from umf_ros.embedding.runtimes import (
 )
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.config import XFEAT_OUTPUTS, locate_weights
-from umf_ros.networks.umf import UMF, NetworkInput
+from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
 
 XFEAT = find("models/xfeat.safetensors")
@@ -67,7 +67,7 @@ def test_torch_runtime_gives_the_outputs_of_the_network(network, tmp_path):
     save_weights(network, tmp_path / "tiny.safetensors", {})
     network = load_weights(tmp_path / "tiny.safetensors")
     found = TorchRuntime(tmp_path / "tiny.safetensors", outputs, "cpu", 1).run(batch)
-    wanted = network.eval()(NetworkInput.of(batch), super_features=True)
+    wanted = network.eval()(batch.tensors(), super_features=True)
     assert set(found) == {*OUTPUTS, *SUPERS}
     np.testing.assert_allclose(found["descriptor"], wanted.descriptor[0].detach(), atol=1e-6)
     np.testing.assert_allclose(found["cloud_saliency"], wanted.cloud.saliency[0].detach(), atol=1e-6)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from tiny_worlds import TINY, some_input
 
+from umf_ros.lab.training.batches import trimmed
 from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.umf import UMF, channels_last
 
@@ -55,8 +56,8 @@ def test_every_parameter_learns(backbone, blocks):
 
 
 def test_trimmed_padding_changes_nothing(network):
-    full, trimmed = network(some_input(TINY)), network(some_input(replace(TINY), trim=True))
-    torch.testing.assert_close(full.descriptor, trimmed.descriptor, atol=1e-5, rtol=1e-4)
+    full, short = network(some_input(TINY)), network(trimmed(some_input(TINY)))
+    torch.testing.assert_close(full.descriptor, short.descriptor, atol=1e-5, rtol=1e-4)
 
 
 def test_a_missing_modality_counts_nothing(network):

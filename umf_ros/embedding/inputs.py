@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Image, Points
-from umf_ros.networks.config import CELLS, FEATURES, NetworkConfig
+from umf_ros.networks.config import CELLS, FEATURES, NetworkConfig, NetworkInput
 
 ORIGIN_M = np.array([0.0, -20.0, -6.0], np.float32)
 VOXEL_M = np.array([1.0, 1.0, 0.3], np.float32)
@@ -148,42 +148,21 @@ def _pad(index: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArra
     return padded, np.arange(size) < len(index)
 
 
-class InputArrays(NamedTuple):
-    """A batch as arrays, with the fields of `NetworkInput` in the same order."""
-
-    image: NDArray[np.float32]
-    image_present: NDArray[np.bool_]
-    grid: NDArray[np.float32]
-    coarse_index: NDArray[np.int64]
-    coarse_mask: NDArray[np.bool_]
-    fine_index: NDArray[np.int64]
-    fine_mask: NDArray[np.bool_]
-
-
 def pack(
-    images: Sequence[NDArray[np.float32] | None], scans: Sequence[VoxelScan], config: NetworkConfig, trim: bool = False
-) -> InputArrays:
+    images: Sequence[NDArray[np.float32] | None], scans: Sequence[VoxelScan], config: NetworkConfig
+) -> NetworkInput:
     """Stack preprocessed frames.
 
     Args:
         images: (H, W) standardised, None for a missing image.
         scans: voxelised, empty for a missing scan.
         config: configuration of the network.
-        trim: cut off padding that no scan of the batch needs; the outputs stay the same.
     """
     blank = np.zeros(config.image_size, np.float32)
-    lengths: dict[str, int | None] = {"grid": None}
-    for size in ("coarse", "fine"):
-        longest = max(1, *(int(getattr(scan, f"{size}_mask").sum()) for scan in scans)) if trim else None
-        lengths |= {f"{size}_index": longest, f"{size}_mask": longest}
-
-    def gather(name: str) -> NDArray:
-        return np.stack([getattr(scan, name)[: lengths[name]] for scan in scans])
-
-    return InputArrays(
-        image=np.stack([blank if image is None else image for image in images])[:, None],
-        image_present=np.array([image is not None for image in images]),
-        **{name: gather(name) for name in lengths},
+    return NetworkInput(
+        np.stack([blank if image is None else image for image in images])[:, None],
+        np.array([image is not None for image in images]),
+        *(np.stack([getattr(scan, name) for scan in scans]) for name in NetworkInput._fields[2:]),
     )
 
 
@@ -199,7 +178,7 @@ def prepare_scan(points: Points | None, intensity: Points | None, config: Networ
     return voxelise(points, intensity, config.coarse_voxels, config.fine_voxels)
 
 
-def blank_input(config: NetworkConfig) -> InputArrays:
+def blank_input(config: NetworkConfig) -> NetworkInput:
     """Return a batch of one frame without image and scan, of the usual shapes."""
     return pack([None], [prepare_scan(None, None, config)], config)
 

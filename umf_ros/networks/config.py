@@ -1,4 +1,4 @@
-"""Configuration of the network and the files of its weights, without torch."""
+"""Configuration and inputs of the network, and the files of its weights; torch is imported when it is needed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
@@ -98,6 +98,38 @@ class NetworkConfig:
             return cls(**fields)
         except ValidationError as error:
             raise WeightsError(f"weights of another architecture: {shortened(problems(error))}") from None
+
+
+class NetworkInput(NamedTuple):
+    """A batch of preprocessed frames, of NumPy arrays or torch tensors, in the order of an exported network's inputs.
+
+    Attributes:
+        image: (B, 1, H, W) float32, normalised.
+        image_present: (B,) bool.
+        grid: (B, 20, 20, 20, 48) float32 features of the voxels, folded (`umf_ros.embedding.inputs.VoxelScan`).
+        coarse_index: (B, T) int64 flat indices of occupied cells of the 10^3 grid.
+        coarse_mask: (B, T) bool; a row without True is a frame without a scan.
+        fine_index: (B, V) int64 flat indices of occupied voxels of the 40^3 grid.
+        fine_mask: (B, V) bool.
+    """
+
+    image: Any
+    image_present: Any
+    grid: Any
+    coarse_index: Any
+    coarse_mask: Any
+    fine_index: Any
+    fine_mask: Any
+
+    def tensors(self) -> Self:
+        """Return a batch of arrays as torch tensors, which share their memory."""
+        import torch
+
+        return type(self)(*(torch.from_numpy(array) for array in self))
+
+    def to(self, device: Any) -> Self:
+        """Return a batch of tensors on another device."""
+        return type(self)(*(tensor.to(device) for tensor in self))
 
 
 SHIPPED = ("umf_scene",)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Self
+from typing import Literal
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from umf_ros.networks.config import NetworkConfig
+from umf_ros.networks.config import NetworkConfig, NetworkInput
 from umf_ros.networks.efficientnet import SceneDescriptor
 from umf_ros.networks.encoders import CELLS, ImageEncoder, VoxelEncoder
 from umf_ros.networks.fusion import (
@@ -25,37 +23,6 @@ from umf_ros.networks.fusion import (
 from umf_ros.networks.local_features import CloudLocal, ImageLocal, IterativeAttention, LocalMap, SuperMap
 
 Branch = Literal["both", "image", "cloud"]
-
-
-class NetworkInput(NamedTuple):
-    """A batch of preprocessed frames; the order of its tensors is that of an exported network's inputs.
-
-    Attributes:
-        image: (B, 1, H, W) float32, normalised.
-        image_present: (B,) bool.
-        grid: (B, 20, 20, 20, 48) float32 features of the voxels, folded (`VoxelScan`).
-        coarse_index: (B, T) int64 flat indices of occupied cells of the 10^3 grid.
-        coarse_mask: (B, T) bool; a row without True is a frame without a scan.
-        fine_index: (B, V) int64 flat indices of occupied voxels of the 40^3 grid.
-        fine_mask: (B, V) bool.
-    """
-
-    image: Tensor
-    image_present: Tensor
-    grid: Tensor
-    coarse_index: Tensor
-    coarse_mask: Tensor
-    fine_index: Tensor
-    fine_mask: Tensor
-
-    @classmethod
-    def of(cls, arrays: Iterable[NDArray[Any]]) -> Self:
-        """Return a batch of arrays (`umf_ros.embedding.inputs.InputArrays`)."""
-        return cls(*(torch.from_numpy(array) for array in arrays))
-
-    def to(self, device: torch.device) -> Self:
-        """Return the batch on another device."""
-        return type(self)(*(tensor.to(device) for tensor in self))
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,6 @@ from umf_ros.core.frames import Frame, Image, Points
 from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.core.levelling import level
 from umf_ros.embedding.inputs import (
-    InputArrays,
     VoxelScan,
     is_blank,
     pack,
@@ -25,10 +24,10 @@ from umf_ros.embedding.inputs import (
     standardise,
 )
 from umf_ros.lab.datasets.sample import Sample
-from umf_ros.networks.config import NetworkConfig
+from umf_ros.networks.config import NetworkConfig, NetworkInput
 
 
-def read_frame(frame: Frame, config: NetworkConfig) -> InputArrays:
+def read_frame(frame: Frame, config: NetworkConfig) -> NetworkInput:
     """Return a batch of one frame: a blank image counts as missing, the tilt of the mount is removed from the scan."""
     image = None if frame.left is None or is_blank(frame.left) else prepare_image(frame.left, config)
     points = None if frame.points is None else transform(level(frame.points, keep_slope=True), frame.points)

@@ -26,7 +26,7 @@ from umf_ros.embedding.inputs import prepare_scan
 from umf_ros.lab.datasets.views import read_frame
 from umf_ros.lab.evaluation.retrieval import Indices
 from umf_ros.networks.fusion import received
-from umf_ros.networks.umf import UMF, NetworkInput, NetworkOutput
+from umf_ros.networks.umf import UMF, NetworkOutput
 from umf_ros.verification.rerank import eligible_superfeatures
 
 SHOWN = 3
@@ -65,7 +65,7 @@ def look(network: UMF, embedder: Embedder, frame: Frame) -> Seen:
     """
     points = None if frame.points is None else transform(level(frame.points, keep_slope=True), frame.points)
     scan = prepare_scan(points, frame.intensity, network.config)
-    batch = NetworkInput.of(read_frame(frame, network.config))
+    batch = read_frame(frame, network.config).tensors()
     maps: list[Tensor] = []
     last = network.get_submodule(f"fusion.layers.{network.config.layers - 1}.cloud_cross")
     hook = last.register_forward_hook(lambda module, tokens, found: maps.append(found[1]))

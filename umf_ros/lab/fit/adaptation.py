@@ -29,7 +29,7 @@ from umf_ros.lab.datasets.sample import distances, places_of
 from umf_ros.lab.datasets.views import read_frame
 from umf_ros.lab.training.losses import neighbourhood_components
 from umf_ros.networks.fusion import Fused
-from umf_ros.networks.umf import UMF, NetworkInput
+from umf_ros.networks.umf import UMF
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
 from umf_ros.sensors.decode import OdometrySample
@@ -200,7 +200,7 @@ class DriveReader:
 def pool(network: UMF, frame: Frame) -> tuple[NDArray, ...]:
     """Input of the heads for a frame: the first five fields of a drive after the stamps, of one keyframe."""
     assert network.scene is not None
-    batch = NetworkInput.of(read_frame(frame, network.config))
+    batch = read_frame(frame, network.config).tensors()
     with torch.inference_mode():
         features = network.encode(batch)
         cloud_present = batch.coarse_mask.any(1)

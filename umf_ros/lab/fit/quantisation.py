@@ -28,7 +28,7 @@ from umf_ros.lab.simulation.camera import Camera
 from umf_ros.lab.simulation.survey import save, shard_plan, survey_world
 from umf_ros.lab.training.prepared_views import draw_look
 from umf_ros.networks.config import XFEAT_OUTPUTS, read_config
-from umf_ros.networks.umf import FlatUmf, NetworkInput
+from umf_ros.networks.umf import FlatUmf
 from umf_ros.networks.weights import load_weights
 from umf_ros.networks.xfeat import load_xfeat
 from umf_ros.sensors.calibration import load_calibration
@@ -246,7 +246,7 @@ def _convert_umf(weights: Path, outputs: tuple[str, ...]) -> Any:
     stem = flat.network.voxel_encoder.get_submodule("stem.1")
     assert isinstance(stem, nn.Sequential) and isinstance(stem[0], nn.Conv3d)
     stem[0] = TwoRangeConvolution(stem[0], SMALL_VALUES)
-    return convert(flat, NetworkInput.of(blank_input(read_config(weights)))._asdict(), outputs)
+    return convert(flat, blank_input(read_config(weights)).tensors()._asdict(), outputs)
 
 
 def _convert_xfeat(weights: Path) -> Any:

@@ -16,8 +16,7 @@ from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.embedding.inputs import pack
 from umf_ros.lab.datasets.sample import Places, Rule, SampleSequence, label, places_of
 from umf_ros.lab.datasets.views import Matches, View, ViewMaker, cell_points, match_cells, match_voxels
-from umf_ros.networks.config import NetworkConfig
-from umf_ros.networks.umf import NetworkInput
+from umf_ros.networks.config import NetworkConfig, NetworkInput
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +148,14 @@ class TrainingBatch:
 def stack_views(views: Sequence[View], config: NetworkConfig) -> NetworkInput:
     """The views as one batch."""
     images = [view.image if view.image_present else None for view in views]
-    return NetworkInput.of(pack(images, [view.scan for view in views], config, trim=True))
+    return trimmed(pack(images, [view.scan for view in views], config)).tensors()
+
+
+def trimmed(batch: NetworkInput) -> NetworkInput:
+    """Cut off padding that no scan of the batch needs; the outputs stay the same."""
+    coarse, fine = (max(1, int(mask.sum(axis=1).max())) for mask in (batch.coarse_mask, batch.fine_mask))
+    lengths = {"coarse_index": coarse, "coarse_mask": coarse, "fine_index": fine, "fine_mask": fine}
+    return batch._replace(**{name: getattr(batch, name)[:, :length] for name, length in lengths.items()})
 
 
 def _thin(batch: NetworkInput) -> NetworkInput:

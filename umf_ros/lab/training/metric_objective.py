@@ -22,7 +22,8 @@ from umf_ros.lab.training.batches import BatchMaker, PairSampler, TrainingBatch,
 from umf_ros.lab.training.losses import Bank, MetricLoss
 from umf_ros.lab.training.networks import MetricSettings, branch_layers, fine_layers
 from umf_ros.lab.training.objective import Judgement, Objective, generator
-from umf_ros.networks.umf import UMF, NetworkInput
+from umf_ros.networks.config import NetworkInput
+from umf_ros.networks.umf import UMF
 
 MODES = ("fused", "image", "cloud")
 
