@@ -15,7 +15,8 @@ from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, expmap, make_pose, relative
 from umf_ros.core.io import write_table
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
-from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, StoredOdometry, closure_row
+from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, closure_row
+from umf_ros.sensors.decode import OdometrySample
 
 PERIOD_NS = 10**9
 START_NS = 1_700_000_000 * 10**9
@@ -51,7 +52,7 @@ class MadeSession:
         """Own clock."""
         return START_NS + (metre - self.first_m) * PERIOD_NS
 
-    def drifting(self, seed: int) -> Iterator[StoredOdometry]:
+    def drifting(self, seed: int) -> Iterator[OdometrySample]:
         """Odometry that drifts, from an origin of its own."""
         pose = np.eye(4)
         steps = relative_steps(self.truth)
@@ -59,7 +60,7 @@ class MadeSession:
         for row, stamp in enumerate(range(self.first_m, self.last_m + 1)):
             pose = pose if row == 0 else pose @ steps[row - 1] @ noise[row - 1]
             spread = np.diag([np.inf] * 6) if row == 0 else COVARIANCE
-            yield StoredOdometry(self.stamp(stamp), pose, None if self.odometry else spread)
+            yield OdometrySample(self.stamp(stamp), pose, None if self.odometry else spread)
 
 
 def relative_steps(poses: Array) -> Array:

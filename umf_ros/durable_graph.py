@@ -20,7 +20,8 @@ from umf_ros.core.io import Schema, SqliteFile
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, Decision, State
 from umf_ros.pose_graph.odometry import Stamps
-from umf_ros.runs.run_file import GraphInput, StoredOdometry
+from umf_ros.runs.run_file import GraphInput
+from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter, Reset
 
 _TABLES = (
@@ -263,7 +264,7 @@ class DurableGraph:
             if not (isinstance(first_ns, int) and isinstance(second_ns, int)):
                 raise ValueError("a stamp that is no number")
             if kind == ODOMETRY:
-                yield StoredOdometry(first_ns, numbers.reshape(4, 4))
+                yield OdometrySample(first_ns, numbers.reshape(4, 4))
             elif kind == CLOSURE:
                 pose, covariance = numbers[:16].reshape(4, 4), numbers[16:52].reshape(6, 6)
                 yield LoopClosure(second_ns, first_ns, pose, covariance, float(numbers[52]))

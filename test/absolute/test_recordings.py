@@ -18,7 +18,8 @@ from umf_ros.core.frames import Frame
 from umf_ros.durable_graph import feed
 from umf_ros.lab.simulation.bag_writer import fix_message, imu_message
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.runs.run_file import RunFile, StoredOdometry
+from umf_ros.runs.run_file import RunFile
+from umf_ros.sensors.decode import OdometrySample
 
 PLACE = np.array([37.72, 15.0, 2550.0])
 ENTRIES = sorted(
@@ -92,7 +93,7 @@ def test_the_file_of_a_run_feeds_a_graph_with_them_in_order(tmp_path: Path) -> N
     fix = AbsoluteMeasurement(Aid.GNSS, START_NS + 1, PLACE, np.eye(3), np.zeros(3))
     with closing(RunFile(tmp_path)) as file:
         for number in range(4):
-            file.append_odometry(number, StoredOdometry(START_NS + number * 10**9, np.eye(4)))
+            file.append_odometry(number, OdometrySample(START_NS + number * 10**9, np.eye(4)))
         file.append_absolute(2, fix)
         file.append_absolute(2, fix)  # as when a recording is played again
         with file.writing():

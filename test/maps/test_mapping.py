@@ -28,7 +28,8 @@ from umf_ros.maps.mapping import (
     unmatched,
 )
 from umf_ros.places.store import stored_sessions
-from umf_ros.runs.run_file import RunFile, StoredOdometry
+from umf_ros.runs.run_file import RunFile
+from umf_ros.sensors.decode import OdometrySample
 
 DAY_NS = 86_400 * 10**9
 
@@ -49,7 +50,7 @@ def bag(tmp_path: Path) -> Path:
     return write_mcap(tmp_path / "a.mcap", traverse(3.0))
 
 
-def odometry_in(folder: Path) -> list[StoredOdometry]:
+def odometry_in(folder: Path) -> list[OdometrySample]:
     with closing(RunFile(folder, read_only=True)) as file:
         return list(file.odometry())
 
@@ -162,7 +163,7 @@ def test_a_narrow_lidar_joins_two_sessions_driven_in_opposite_directions(tmp_pat
         with closing(RunFile(folder)) as file:
             for row, one in enumerate(keyframes):
                 assert one.odom_T_body is not None
-                file.append_odometry(row, StoredOdometry(one.stamp_ns, one.odom_T_body, None))
+                file.append_odometry(row, OdometrySample(one.stamp_ns, one.odom_T_body, None))
         add_places(target, name, keyframes, ("none", 2), {"start_ns": keyframes[0].stamp_ns})
     out, back = target.sessions
     true = {one.stamp_ns: pose for one, pose in zip(outing.keyframes, outing.truth, strict=True)}

@@ -11,10 +11,11 @@ import pytest
 from umf_ros.core.config import PoseGraphSettings, Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import make_pose
-from umf_ros.durable_graph import StoredOdometry, feed
+from umf_ros.durable_graph import feed
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.runs.run_file import RunFile
+from umf_ros.sensors.decode import OdometrySample
 
 SECOND_NS = 10**9
 UNKNOWN = np.diag([np.inf] * 6)
@@ -24,12 +25,12 @@ def at(x: float) -> np.ndarray:
     return make_pose(np.eye(3), [x, 0, 0])
 
 
-def messages(*positions: float) -> list[StoredOdometry]:
-    return [StoredOdometry(row * SECOND_NS, at(x)) for row, x in enumerate(positions)]
+def messages(*positions: float) -> list[OdometrySample]:
+    return [OdometrySample(row * SECOND_NS, at(x)) for row, x in enumerate(positions)]
 
 
 TRACKED = [
-    StoredOdometry(second * SECOND_NS, at(x), covariance)
+    OdometrySample(second * SECOND_NS, at(x), covariance)
     for second, x, covariance in ((0, 0, UNKNOWN), (1, 1, 0.01 * np.eye(6)), (5, 0, UNKNOWN), (6, 1, 0.04 * np.eye(6)))
 ]
 
@@ -42,7 +43,7 @@ def folder(tmp_path: Path) -> MapFolder:
 
 
 @pytest.mark.parametrize("put", [messages(0, 1, 2, 3), TRACKED], ids=["messages", "tracked"])
-def test_odometry_is_read_back_as_it_was(folder: MapFolder, put: list[StoredOdometry]) -> None:
+def test_odometry_is_read_back_as_it_was(folder: MapFolder, put: list[OdometrySample]) -> None:
     with closing(RunFile(folder.folder_of("a"))) as file:
         for number, one in enumerate(put):
             file.append_odometry(number, one)

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.durable_graph import StoredOdometry, feed
+from umf_ros.durable_graph import feed
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.runs.run_file import read_closures, read_keyframes
+from umf_ros.sensors.decode import OdometrySample
 
 Stamps = NDArray[np.int64]
 
@@ -97,7 +98,7 @@ def solve(folder: MapFolder, edits: Mapping[tuple[int, int], State] | None = Non
     return JointMap(graph, sessions, *verdicts, graph.world())
 
 
-def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, odometry: list[StoredOdometry]) -> JointSession:
+def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, odometry: list[OdometrySample]) -> JointSession:
     """Return a session with the poses of its keyframes in the solved map."""
     stamps = read_keyframes(folder.folder_of(session.name) / "keyframes.csv")["stamp_ns"]
     poses, known = graph.poses_at(stamps + session.shift_ns)

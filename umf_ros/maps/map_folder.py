@@ -18,7 +18,8 @@ from umf_ros.core.errors import UmfError, reading, writing
 from umf_ros.core.frames import State
 from umf_ros.core.io import write_atomically
 from umf_ros.places.database import PLACES_OF_MAP
-from umf_ros.runs.run_file import RunFile, StoredOdometry
+from umf_ros.runs.run_file import RunFile
+from umf_ros.sensors.decode import OdometrySample
 
 SCHEMA_VERSION = 1
 BETWEEN, EDITS = "closures_between.csv", "edits.json"
@@ -108,7 +109,7 @@ class MapFolder:
         """Run folder of a recording, stamped by its own clock."""
         return self.path / "sessions" / name
 
-    def odometry_of(self, name: str) -> list[StoredOdometry]:
+    def odometry_of(self, name: str) -> list[OdometrySample]:
         """Return the odometry of a recording, stamped by its own clock."""
         with closing(RunFile(self.folder_of(name), read_only=True)) as file:
             return list(file.odometry())

@@ -43,8 +43,9 @@ from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
-from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, StoredOdometry, closure_row
+from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, closure_row
 from umf_ros.runs.writer import PLACES, count_drops
+from umf_ros.sensors.decode import OdometrySample
 from umf_ros.submaps import SubmapFinder
 from umf_ros.verification import Hypothesis, Verifier
 
@@ -144,13 +145,13 @@ def _track(folder: Path, settings: Settings) -> None:
             file.append_odometry(number, one)
 
 
-def track(keyframes: Iterable[Keyframe], settings: Verification) -> tuple[list[StoredOdometry], list[Keyframe]]:
+def track(keyframes: Iterable[Keyframe], settings: Verification) -> tuple[list[OdometrySample], list[Keyframe]]:
     """Track a recording without odometry by closures between consecutive keyframes.
 
     Two consecutive keyframes without a closure begin a new session, which other closures have to connect. Returns the
     poses, and the keyframes with `odom_T_body`, `path_length_m` and `session`, which counts from 0.
     """
-    odometry: list[StoredOdometry] = []
+    odometry: list[OdometrySample] = []
     tracked: list[Keyframe] = []
     pose, path_m, session = np.eye(4), 0.0, 0
     before: Keyframe | None = None
@@ -162,7 +163,7 @@ def track(keyframes: Iterable[Keyframe], settings: Verification) -> tuple[list[S
         else:
             step, covariance = closure.match_T_query, closure.covariance
             pose, path_m = pose @ step, path_m + float(np.linalg.norm(step[:3, 3]))
-        odometry.append(StoredOdometry(keyframe.stamp_ns, pose, covariance))
+        odometry.append(OdometrySample(keyframe.stamp_ns, pose, covariance))
         tracked.append(replace(keyframe, odom_T_body=pose, path_length_m=path_m, session=session))
         before = keyframe
     return odometry, tracked
@@ -332,7 +333,7 @@ def _add_run(target: MapFolder, run: Path, new: list[Keyframe]) -> MapSession:
     with closing(RunFile(folder)) as file:
         for number, one in enumerate(new):
             assert one.odom_T_body is not None
-            file.append_odometry(number, StoredOdometry(one.stamp_ns, one.odom_T_body))
+            file.append_odometry(number, OdometrySample(one.stamp_ns, one.odom_T_body))
     keyframes = [[one.stamp_ns, one.session, f"{one.path_length_m:.4f}"] for one in new]
     write_table(folder / "keyframes.csv", COLUMNS["keyframes"], keyframes)
     write_table(folder / "closures.csv", CLOSURES, [])

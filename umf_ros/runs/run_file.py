@@ -25,6 +25,7 @@ from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.core.io import Schema, SqliteFile, write_table
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureReason, ClosureVerdict, State
+from umf_ros.sensors.decode import OdometrySample
 from umf_ros.verification.hypothesis import ACCEPTED, Hypothesis, RejectReason
 
 NAME = "run.sqlite"
@@ -73,21 +74,6 @@ Endpoints = tuple[int, int]
 """Stamps in ns of a closure's query and match."""
 
 
-class StoredOdometry(NamedTuple):
-    """An odometry message, or the tracked pose of a keyframe of a recording without odometry.
-
-    Attributes:
-        stamp_ns: of the pose.
-        odom_T_body: (4, 4).
-        covariance: None for a message; (6, 6) of the motion since the previous tracked pose in ROS order, axes of the
-            previous body, infinite where the motion is unknown and a session begins.
-    """
-
-    stamp_ns: int
-    odom_T_body: Array
-    covariance: Array | None = None
-
-
 class Picture(NamedTuple):
     """Small pictures of a keyframe for the report.
 
@@ -105,7 +91,7 @@ class Picture(NamedTuple):
     scan: NDArray[np.int16]
 
 
-GraphInput = LoopClosure | StoredOdometry | AbsoluteMeasurement
+GraphInput = LoopClosure | OdometrySample | AbsoluteMeasurement
 """Inputs of a pose graph."""
 
 
@@ -156,7 +142,7 @@ class RunFile:
         values = (*picture[:4], picture.scan.astype("<i2").tobytes())
         self._file.connection.execute("INSERT INTO picture VALUES (?, ?, ?, ?, ?)", values)
 
-    def append_odometry(self, number: int, odometry: StoredOdometry) -> None:
+    def append_odometry(self, number: int, odometry: OdometrySample) -> None:
         """Add the n-th odometry of the recording with the next transaction; a known one stays."""
         stamp_ns, pose, covariance = odometry
         spread = None if covariance is None else np.ascontiguousarray(covariance, np.float64).tobytes()
@@ -186,7 +172,7 @@ class RunFile:
         with self._file.reading():
             return [parse_closure(dict(zip(CLOSURES, row, strict=True))) for row in self.rows("closures")]
 
-    def odometry(self) -> list[StoredOdometry]:
+    def odometry(self) -> list[OdometrySample]:
         """Return the odometry of the run in the order of arrival."""
         found = []
         with self._file.reading() as connection:
@@ -195,7 +181,7 @@ class RunFile:
                 pose = np.vstack([np.frombuffer(data, np.float64).reshape(3, 4), (0, 0, 0, 1)])
                 tracked = bool(spread) and spread[0] is not None
                 covariance = np.frombuffer(spread[0], np.float64).reshape(6, 6) if tracked else None
-                found.append(StoredOdometry(int(stamp_ns), pose, covariance))
+                found.append(OdometrySample(int(stamp_ns), pose, covariance))
         return found
 
     def graph_inputs(self) -> Iterator[GraphInput]:

@@ -31,12 +31,12 @@ from umf_ros.runs.run_file import (
     STAGES,
     Picture,
     RunFile,
-    StoredOdometry,
     candidate_row,
     closure_row,
     inlier_rows,
     pose_numbers,
 )
+from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import Input
 from umf_ros.sensors.synchronizer import InputCounter
 
@@ -167,7 +167,7 @@ class RunRecorder:
 
     def record_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
         """Write the next odometry message of the recording, with the next keyframe."""
-        self._file.append_odometry(self._odometry, StoredOdometry(stamp_ns, odom_T_body))
+        self._file.append_odometry(self._odometry, OdometrySample(stamp_ns, odom_T_body))
         self._odometry += 1
 
     def record_absolute(self, measurement: AbsoluteMeasurement) -> None:

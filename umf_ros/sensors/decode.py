@@ -70,10 +70,18 @@ class Cloud:
 
 
 class OdometrySample(NamedTuple):
-    """One pose (4, 4) of the odometry and its stamp."""
+    """An odometry message, or the tracked pose of a keyframe of a recording without odometry.
+
+    Attributes:
+        stamp_ns: of the pose.
+        odom_T_body: (4, 4).
+        covariance: None for a message; (6, 6) of the motion since the previous tracked pose in ROS order, axes of the
+            previous body, infinite where the motion is unknown and a session begins.
+    """
 
     stamp_ns: int
     odom_T_body: Array
+    covariance: Array | None = None
 
 
 def stamp_ns(message: Any) -> int:

@@ -269,4 +269,4 @@ def check_sensors(
             check.take(item)
         else:
             samples.append(item)
-    return check.report(Trajectory.rising(samples) or instead)
+    return check.report(Trajectory.rising(one[:2] for one in samples) or instead)
