@@ -10,7 +10,7 @@ import numpy as np
 from recordings import CLOUD, LEFT, RIGHT, Entry, cloud, make, traverse
 from rosbags.typesys.store import Typestore
 
-from umf_ros.bags.storages import message_types
+from umf_ros.bags.reader import message_types
 
 STORE: Typestore = message_types()
 LIVOX = "livox_ros_driver2/msg/CustomMsg"

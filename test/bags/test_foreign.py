@@ -25,8 +25,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.reader import decode, open_bag
-from umf_ros.bags.storages import RawMessage
+from umf_ros.bags.reader import RawMessage, decode, open_bag
 from umf_ros.core.errors import BagError, MessageError
 
 ENTRIES = traverse(1.0)

@@ -23,10 +23,9 @@ from recordings import small_settings, traverse, write_db3, write_mcap, write_ro
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.bags import storages
+from umf_ros.bags import reader
 from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.reader import open_bag
-from umf_ros.bags.storages import unpack
+from umf_ros.bags.reader import open_bag, unpack
 from umf_ros.core.errors import BagError
 
 ENTRIES = traverse(0.4)
@@ -94,7 +93,7 @@ def test_a_chunk_that_claims_gigabytes_is_not_unpacked(tmp_path: Path) -> None:
 
 def test_a_bzip2_chunk_is_unpacked_to_a_limit_only(monkeypatch: pytest.MonkeyPatch) -> None:
     assert unpack("bz2", bz2.compress(b"abc" * 1000)) == b"abc" * 1000
-    monkeypatch.setattr("umf_ros.bags.storages.LARGEST_CHUNK", 2**16)
+    monkeypatch.setattr("umf_ros.bags.reader.LARGEST_CHUNK", 2**16)
     with pytest.raises(ValueError, match="more than"):
         unpack("bz2", bz2.compress(bytes(2**20)))
 
@@ -107,7 +106,7 @@ def zeros_in_lz4(count: int) -> bytes:
 
 def test_an_lz4_chunk_is_unpacked_to_a_limit_only(monkeypatch: pytest.MonkeyPatch) -> None:
     assert unpack("lz4", lz4.frame.compress(b"abc" * 1000)) == b"abc" * 1000
-    monkeypatch.setattr("umf_ros.bags.storages.LARGEST_CHUNK", 2**16)
+    monkeypatch.setattr("umf_ros.bags.reader.LARGEST_CHUNK", 2**16)
     with pytest.raises(ValueError, match="more than"):
         unpack("lz4", zeros_in_lz4(2**25))
 
@@ -134,7 +133,7 @@ def test_chunks_across_each_other_come_in_order_as_far_as_there_is_memory(
     with (tmp_path / "a.mcap").open("rb") as file:
         expected = [(message.log_time, message.data) for _, _, message in make_reader(file).iter_messages(["/a", "/c"])]
     assert [(raw.log_ns, raw.data) for raw in bag.raw_messages(["/a", "/c"])] == expected
-    monkeypatch.setattr("umf_ros.bags.storages.MOST_WAITING", 2000)
+    monkeypatch.setattr("umf_ros.bags.reader.MOST_WAITING", 2000)
     held = [(raw.log_ns, raw.data) for raw in bag.raw_messages(["/a", "/c"])]
     assert sorted(held) == sorted(expected) and held != expected
 
@@ -147,18 +146,18 @@ def test_no_packing_hides_how_large_a_chunk_is(broken: bool, tmp_path: Path, mon
             path.write_bytes(path.read_bytes()[:-100])
         assert len(list(open_bag(path).raw_messages())) == 200
     with monkeypatch.context() as limited:
-        limited.setattr("umf_ros.bags.storages.LARGEST_CHUNK", 2500)
+        limited.setattr("umf_ros.bags.reader.LARGEST_CHUNK", 2500)
         for packing in CompressionType:  # what they claim is looked at before
             with pytest.raises(BagError, match="holds no message"):
                 open_bag(tmp_path / f"{packing}.mcap")
-    really = storages.unpack
+    really = reader.unpack
 
     def fooled(compression: str, data: bytes) -> bytes:  # as if the file had claimed less than it holds
         with monkeypatch.context() as limited:
-            limited.setattr(storages, "LARGEST_CHUNK", 2500)
+            limited.setattr(reader, "LARGEST_CHUNK", 2500)
             return really(compression, data)
 
-    monkeypatch.setattr(storages, "unpack", fooled)
+    monkeypatch.setattr(reader, "unpack", fooled)
     path = tmp_path / f"{CompressionType.LZ4}.mcap"
     with pytest.raises(BagError, match="holds no message" if broken else "holds more than"):
         list(open_bag(path).raw_messages())
@@ -175,7 +174,7 @@ def test_a_chunk_of_ros_1_in_lz4_is_unpacked_to_a_limit_only(tmp_path: Path, mon
         for log_ns in range(1, 50):
             writer.write(connection, log_ns, store.serialize_ros1(message, message.__msgtype__))
     assert len(list(open_bag(path).raw_messages())) == 49
-    monkeypatch.setattr("umf_ros.bags.storages.LARGEST_CHUNK", 2**12)
+    monkeypatch.setattr("umf_ros.bags.reader.LARGEST_CHUNK", 2**12)
     with pytest.raises(BagError, match="holds more than"):
         list(open_bag(path).raw_messages())
 

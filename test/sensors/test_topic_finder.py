@@ -12,7 +12,6 @@ from umf_ros.sensors.topic_finder import (
     FRONT_END,
     TopicFinder,
     describe_inputs,
-    find_topics,
     known_dataset,
     must_find,
     with_topics,
@@ -35,8 +34,12 @@ def pair(left: str, right: str) -> dict[str, str]:
     return {f"{camera}/{name}": kind for camera in (left, right) for name, kind in (("image_rect", IMAGE), ("camera_info", INFO))}  # noqa: E501  # fmt: skip
 
 
+def found_in(types: dict[str, str]) -> Topics:
+    return with_topics(Settings(), types).topics
+
+
 def test_a_lidar_and_a_camera_are_found_by_type_and_its_own_topics_are_none() -> None:
-    topics = find_topics(ROVER).only(FRONT_END)
+    topics = found_in(ROVER)
     assert topics == Topics(
         left_image="/camera/image_raw",
         right_image="",
@@ -49,14 +52,14 @@ def test_a_lidar_and_a_camera_are_found_by_type_and_its_own_topics_are_none() ->
 
 def test_the_best_pictures_of_one_camera_are_taken() -> None:
     images = ("/camera/image_rect_color", "/camera/image_rect", "/camera/image_raw", "/camera/depth/image_raw")
-    assert find_topics(dict.fromkeys(images, IMAGE)).only(FRONT_END).left_image == "/camera/image_rect"
+    assert found_in(dict.fromkeys(images, IMAGE)).left_image == "/camera/image_rect"
     only = {"/camera/image_raw/compressed": COMPRESSED, "/camera/camera_info": INFO}
-    found = find_topics(only).only(FRONT_END)
+    found = found_in(only)
     assert (found.left_image, found.left_info) == ("/camera/image_raw/compressed", "/camera/camera_info")
 
 
 def test_two_cameras_are_a_pair_by_their_names_alone() -> None:
-    found = find_topics(pair("/stereo/right", "/stereo/left")).only(FRONT_END)
+    found = found_in(pair("/stereo/right", "/stereo/left"))
     assert (found.left_image, found.right_image) == ("/stereo/left/image_rect", "/stereo/right/image_rect")
     assert (found.left_info, found.right_info) == ("/stereo/left/camera_info", "/stereo/right/camera_info")
 
@@ -73,12 +76,12 @@ def test_two_cameras_are_a_pair_by_their_names_alone() -> None:
 )
 def test_what_is_ambiguous_is_an_error_that_lists_the_candidates(types: dict[str, str], told: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        find_topics(types).only(FRONT_END)
+        found_in(types)
     assert told in str(caught.value) and "topics.NAME" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_camera_with_a_camera_info_goes_before_pictures_of_a_lidar() -> None:
-    found = find_topics({**ROVER, "/lidar/signal": IMAGE, "/lidar/range": IMAGE}).only(FRONT_END)
+    found = found_in({**ROVER, "/lidar/signal": IMAGE, "/lidar/range": IMAGE})
     assert found.left_image == "/camera/image_raw"
 
 

@@ -13,8 +13,7 @@ import numpy as np
 import yaml
 
 from umf_ros.bags.presets import settings_for
-from umf_ros.bags.reader import Bag, open_bag
-from umf_ros.bags.storages import RawMessage, message_types
+from umf_ros.bags.reader import Bag, RawMessage, message_types, open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings, load_preset, topics_of
 from umf_ros.core.geometry import from_quaternion, to_quaternion

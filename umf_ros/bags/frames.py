@@ -11,8 +11,7 @@ import numpy as np
 
 from umf_ros.absolute.measurement import ABSOLUTE_TYPES, AbsoluteDecoder, AbsoluteMeasurement, Aid
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
-from umf_ros.bags.reader import Bag, decode
-from umf_ros.bags.storages import RawMessage
+from umf_ros.bags.reader import Bag, RawMessage, decode
 from umf_ros.bags.trajectories import decode_ground_truth
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics, topics_of

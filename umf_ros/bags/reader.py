@@ -1,13 +1,345 @@
-"""Recordings of any format, read without a ROS environment."""
+"""Recordings of any format, read without a ROS environment: mcap files, db3 folders and ROS 1 bags."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import bz2
+import heapq
+import re
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from umf_ros.bags.storages import RawMessage, RecordedFile, TopicInfo, message_types, open_files
+import lz4.frame
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+from zstandard import ZstdError, frame_content_size
+
 from umf_ros.core.errors import BagError, MessageError, one_line, reading
+from umf_ros.sensors.decode import LIVOX
+
+LARGEST_CHUNK = 2**28
+"""Most bytes of an unpacked chunk, and of any record; recorders write some megabytes."""
+
+
+LIVOX_DEFINITION = """
+std_msgs/Header header
+uint64 timebase
+uint32 point_num
+uint8 lidar_id
+uint8[3] rsvd
+CustomPoint[] points
+================================================================================
+MSG: {package}/CustomPoint
+uint32 offset_time
+float32 x
+float32 y
+float32 z
+uint8 reflectivity
+uint8 tag
+uint8 line
+"""
+"""Type of message of Livox' drivers; recordings of them carry it too."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    """Message type, as in `sensor_msgs/msg/Image`, and number of messages of a topic."""
+
+    type: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class RawMessage:
+    """A message recorded at `log_ns`, its data as ROS 2 serialises them (CDR), for all formats of recordings."""
+
+    topic: str
+    log_ns: int
+    type: str
+    data: bytes
+
+
+@cache
+def message_types() -> Typestore:
+    """Return the message definitions of ROS 2 Jazzy, and those of Livox."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for kind in LIVOX:
+        definition = LIVOX_DEFINITION.format(package=kind.split("/")[0])
+        store.register(get_types_from_msg(definition, kind))
+    return store
+
+
+_DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}
+
+
+def unpack(compression: str, data: bytes) -> bytes:
+    """Return the contents of a chunk compressed as "bz2" or "lz4".
+
+    Raises:
+        ValueError: they are larger than `LARGEST_CHUNK`.
+    """
+    unpacked = _DECOMPRESSORS[compression]().decompress(data, LARGEST_CHUNK + 1)
+    if len(unpacked) > LARGEST_CHUNK:
+        raise ValueError(f"a chunk holds more than {LARGEST_CHUNK} bytes")
+    return unpacked
+
+
+# exceptions of the mcap library and the decompressors on damaged data
+_DAMAGE = (McapError, struct.error, ZstdError, ValueError, RuntimeError, EOFError, LookupError, TypeError, MemoryError)
+
+_CHUNK_HEAD = 64
+"""Bytes at the start of a chunk's record that hold its stated size, compression included."""
+
+SORTING_WINDOW_NS = 1_000_000_000
+"""Without an index, messages are sorted within this window of time."""
+MOST_WAITING = 2**28
+"""Most bytes of messages in the reorder buffer; a second of a recording has some dozens of megabytes."""
+PlacedMessage = tuple[int, tuple[int, int], RawMessage]
+"""Lower bound of the times of later messages, position in the file to order equal times, message."""
+
+
+class McapFile:
+    """An mcap file, read by its index; without one, as a killed recorder leaves it, up to its truncation."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._fault, self.warning = path, "", ""
+        self._chunks: list[ChunkIndex] = []
+        self.types: dict[str, str] = {}
+        self.counts: Counter[str] = Counter()
+        try:
+            self._read_index()
+        except (*_DAMAGE, OSError):  # too short to seek in
+            self._scan()
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Yield messages of some topics in the order of their recording."""
+        return _in_order(self._by_index(topics) if self._chunks else self._read_sequentially(topics))
+
+    def _read_index(self) -> None:
+        with self._path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        if summary is None or summary.statistics is None or not summary.chunk_indexes:
+            raise ValueError("no index")
+        channels = {key: channel for key, channel in summary.channels.items() if channel.message_encoding == "cdr"}
+        if summary.channels and not channels:
+            encodings = ", ".join(sorted({channel.message_encoding for channel in summary.channels.values()}))
+            raise BagError(f"{self._path} holds messages encoded as {encodings}; only those of ROS 2 (cdr) can be read")
+        _check_chunks(self._path, summary.chunk_indexes)
+        self._channels = {
+            key: (channel.topic, summary.schemas[channel.schema_id].name) for key, channel in channels.items()
+        }
+        self.types = dict(self._channels.values())
+        for key, count in summary.statistics.channel_message_counts.items():
+            if key in channels:
+                self.counts[channels[key].topic] += count
+        self.start_ns, self.end_ns = summary.statistics.message_start_time, summary.statistics.message_end_time
+        self._chunks = sorted(summary.chunk_indexes, key=lambda one: (one.message_start_time, one.chunk_start_offset))
+
+    def _scan(self) -> None:
+        self.start_ns, self.end_ns = 2**63, 0
+        for message in self._stream():
+            self.types[message.topic] = message.type
+            self.counts[message.topic] += 1
+            self.start_ns = min(self.start_ns, message.log_ns)
+            self.end_ns = max(self.end_ns, message.log_ns)
+        if self._fault:
+            seconds, count = max(0, self.end_ns - self.start_ns) * 1e-9, self.counts.total()
+            self.warning = f"{self._path} is truncated; its first {seconds:.1f} s ({count} messages) are readable"
+
+    def _by_index(self, topics: Collection[str]) -> Iterator[PlacedMessage]:
+        wanted = {key: channel for key, channel in self._channels.items() if channel[0] in topics}
+        with self._path.open("rb") as stream:
+            for index in self._chunks:
+                if index.message_index_offsets and not wanted.keys() & index.message_index_offsets.keys():
+                    continue
+                stream.seek(index.chunk_start_offset + 9)
+                for number, record in enumerate(_unpacked(Chunk.read(ReadDataStream(stream)))):
+                    if isinstance(record, Message) and record.channel_id in wanted:
+                        topic, kind = wanted[record.channel_id]
+                        message = RawMessage(topic, record.log_time, kind, record.data)
+                        yield index.message_start_time, (index.chunk_start_offset, number), message
+
+    def _read_sequentially(self, topics: Collection[str]) -> Iterator[PlacedMessage]:
+        for number, message in enumerate(self._stream()):
+            if message.topic in topics:
+                yield message.log_ns - SORTING_WINDOW_NS, (0, number), message
+
+    def _stream(self) -> Iterator[RawMessage]:
+        """Yield the messages in the order of the file."""
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        with self._path.open("rb") as stream:
+            try:
+                limit = min(self._path.stat().st_size, LARGEST_CHUNK)
+                records = StreamReader(stream, emit_chunks=True, record_size_limit=limit).records
+                for record in chain.from_iterable(
+                    _unpacked(one) if isinstance(one, Chunk) else [one] for one in records
+                ):
+                    if isinstance(record, Schema):
+                        schemas[record.id] = record
+                    elif isinstance(record, Channel):
+                        channels[record.id] = record
+                    elif isinstance(record, Message):
+                        channel = channels.get(record.channel_id)
+                        if channel and channel.message_encoding == "cdr" and channel.schema_id in schemas:
+                            type_name = schemas[channel.schema_id].name
+                            yield RawMessage(channel.topic, record.log_time, type_name, record.data)
+            except _DAMAGE as error:
+                self._fault = str(error) or type(error).__name__
+
+
+def _in_order(messages: Iterable[PlacedMessage]) -> Iterator[RawMessage]:
+    """Sort messages by time in a bounded reorder buffer; on overflow they pass unsorted."""
+    waiting: list[tuple[int, tuple[int, int], RawMessage]] = []
+    held = 0
+    for bound_ns, place, message in messages:
+        heapq.heappush(waiting, (message.log_ns, place, message))
+        held += len(message.data)
+        while waiting and (waiting[0][0] < bound_ns or held > MOST_WAITING):
+            first = heapq.heappop(waiting)[2]
+            held -= len(first.data)
+            yield first
+    while waiting:
+        yield heapq.heappop(waiting)[2]
+
+
+def _unpacked(chunk: Chunk) -> Iterable[McapRecord]:
+    """Return the records of a chunk; raise a `ValueError` if it is larger than `LARGEST_CHUNK`."""
+    _check_chunk(chunk.uncompressed_size, chunk.compression, chunk.data[:18])
+    if chunk.compression == "lz4":
+        chunk = replace(chunk, compression="", data=unpack("lz4", chunk.data))
+    return breakup_chunk(chunk)
+
+
+def _check_chunks(path: Path, indexes: Collection[ChunkIndex]) -> None:
+    """Raise a `ValueError` if a chunk, by its own header or the index, lies outside of the file or is too large."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        for index in indexes:
+            if index.chunk_start_offset + index.chunk_length > size or index.chunk_length > LARGEST_CHUNK:
+                raise ValueError("a chunk lies beyond the end")
+            stream.seek(index.chunk_start_offset + 9)  # after opcode and length
+            head = stream.read(_CHUNK_HEAD)
+            (claimed,) = struct.unpack_from("<Q", head, 16)
+            (letters,) = struct.unpack_from("<I", head, 28)
+            compression = head[32 : 32 + letters].decode("ascii", "replace") if letters < 8 else "?"
+            _check_chunk(max(claimed, index.uncompressed_size), compression, head[40 + letters :])
+
+
+def _check_chunk(claimed: int, compression: str, start: bytes) -> None:
+    if compression == "zstd":  # the frame repeats the size, and the decompressor uses that
+        claimed = max(claimed, frame_content_size(start))
+    if claimed > LARGEST_CHUNK:
+        raise ValueError(f"a chunk states {claimed} bytes")
+
+
+_LIMITED: dict[Any, Any] = {bz2.decompress: partial(unpack, "bz2"), lz4.frame.decompress: partial(unpack, "lz4")}
+"""Decompressors of chunks, and those with a limit that replace them."""
+
+
+class RosbagsFile:
+    """A folder of ROS 2, a db3 file, or a ROS 1 bag.
+
+    Messages of ROS 1 are converted to ROS 2; types without a counterpart are left out.
+    """
+
+    def __init__(self, path: Path, ros1: bool = False) -> None:
+        self._path = path
+        self._reader: Any = Reader1 if ros1 else Reader2
+        self._to_cdr = message_types().ros1_to_cdr if ros1 else None
+        self.warning = _warning_of_log(path)
+        self.counts = Counter[str]()
+        with self._reader(path) as reader:
+            connections = self._readable(reader)
+            self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
+        self.types = {connection.topic: connection.msgtype for connection in connections}
+        for connection in connections:
+            self.counts[connection.topic] += connection.msgcount
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Yield messages of some topics in the order of their recording."""
+        with self._reader(self._path) as reader:
+            wanted = [connection for connection in self._readable(reader) if connection.topic in topics]
+            for place, chunk in getattr(reader, "chunks", {}).items():  # of ROS 1
+                limited = _LIMITED.get(chunk.decompressor, chunk.decompressor)
+                reader.chunks[place] = chunk._replace(decompressor=limited)
+            for connection, log_ns, data in reader.messages(wanted) if wanted else ():
+                cdr = bytes(self._to_cdr(data, connection.msgtype)) if self._to_cdr else data
+                yield RawMessage(connection.topic, log_ns, connection.msgtype, cdr)
+
+    def _readable(self, reader: Any) -> list[Connection]:
+        known = message_types().fielddefs
+        return [one for one in reader.connections if self._to_cdr is None or one.msgtype in known]
+
+
+def _warning_of_log(path: Path) -> str:
+    """Return a warning about messages that a killed recorder left in an SQLite log, which is not read."""
+    for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
+        log = file.with_name(file.name + "-wal")
+        if log.is_file() and log.stat().st_size:
+            return f"{log} holds messages that are not read: sqlite3 {file.name} 'PRAGMA wal_checkpoint' adds them"
+    return ""
+
+
+RecordedFile = McapFile | RosbagsFile
+"""One file of a recording: number and type of its messages by topic, and the time of the first and the last."""
+
+_MCAP, _SQLITE, _ROS1 = b"\x89MCAP0\r\n", b"SQLite format 3\x00", b"#ROSBAG V2.0"
+
+
+def open_files(path: Path) -> list[RecordedFile]:
+    """Open the files of a recording, a file or a folder, in the order in which they were written.
+
+    Raises:
+        BagError: it is not a recording, or damaged beyond use.
+    """
+    if path.is_dir():
+        return _open_folder(path)
+    if not path.is_file():  # a pipe blocks until it is written to
+        raise BagError(f"{path} is not a recording: neither a file nor a folder")
+    with path.open("rb") as file:
+        start = file.read(16)
+    if not start:
+        raise BagError(f"{path} is empty")
+    if start.startswith(_MCAP):
+        return [McapFile(path)]
+    if start.startswith((_SQLITE, _ROS1)):
+        return [RosbagsFile(path, ros1=start.startswith(_ROS1))]
+    raise BagError(f"{path} is not a recording: neither mcap nor db3 nor a ROS 1 bag")
+
+
+def _open_folder(path: Path) -> list[RecordedFile]:
+    mcap, db3 = (_in_number_order(one for one in path.glob(f"*.{kind}") if one.is_file()) for kind in ("mcap", "db3"))
+    if mcap:
+        return [McapFile(one) for one in mcap]
+    if (path / "metadata.yaml").is_file():
+        return [RosbagsFile(path)]
+    if db3:  # the recorder was killed before it wrote its metadata
+        return [RosbagsFile(one) for one in db3]
+    raise BagError(f"{path} is not a recording: it holds neither metadata.yaml nor mcap or db3 files")
+
+
+def _in_number_order(paths: Iterable[Path]) -> list[Path]:
+    """Return the files of one recording in the order of writing: `x_10` after `x_9`."""
+
+    def number(path: Path) -> int:
+        numbers = re.findall(r"\d+", path.stem)
+        return int(numbers[-1]) if numbers else 0
+
+    return sorted(paths, key=number)
 
 
 class Bag:

@@ -10,8 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
-from umf_ros.bags.reader import Bag, decode
-from umf_ros.bags.storages import RawMessage
+from umf_ros.bags.reader import Bag, RawMessage, decode
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import BagError, MessageError, reading
 from umf_ros.core.geometry import to_enu

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
-from umf_ros.bags.storages import message_types
+from umf_ros.bags.reader import message_types
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.config import Topics
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose, to_quaternion

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -12,7 +13,7 @@ from umf_ros.absolute.measurement import read_verdict_states
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.config import TerrainSettings
 from umf_ros.core.errors import ConfigError, writing
-from umf_ros.core.frames import Frame, Keyframe, LoopClosure, Points, State
+from umf_ros.core.frames import Frame, Keyframe, State
 from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.run_file import read_closures, read_verdicts
@@ -26,6 +27,8 @@ Item = TypeVar("Item")
 GREY, BLUE, GREEN, AMBER, RED = (150, 150, 150), (60, 120, 216), (40, 160, 60), (240, 180, 30), (220, 40, 40)
 STATE_COLOURS = {State.ACCEPTED: GREEN, State.PENDING: AMBER, State.REJECTED: RED}
 GRID_COLOURS = {FREE: GREEN, NEAR_LIMIT: AMBER, OBSTACLE: RED}
+BATCH = 200
+"""Keyframes whose scans are read and added to the map of the ground together: bounds the memory."""
 MOST_POINTS = 5000
 """Most points of a logged scan; a viewer shows thousands of scans together."""
 
@@ -34,7 +37,7 @@ class RerunLog:
     """Writer of an .rrd file during a run.
 
     Images and scans are those of the keyframes, in the odometry's frame; without odometry there are no poses,
-    and only images and numbers are logged.
+    and only images and numbers are logged. Whole scans wait in a temporary file for their poses in the map.
 
     Args:
         path: the file to write.
@@ -57,7 +60,8 @@ class RerunLog:
         self._log.save(path)
         self._frame: Frame | None = None
         self._places: dict[int, Array] = {}
-        self._scans: dict[int, tuple[Points, Array]] = {}
+        self._stamps: list[int] = []
+        self._scans = TemporaryFile()  # noqa: SIM115 (deleted with the log)
 
     def watch(self, stream: Iterable[Item]) -> Iterator[Item]:
         """Yield the same stream; its latest frame is kept until its detection is logged."""
@@ -81,8 +85,7 @@ class RerunLog:
 
     def finish(self, folder: Path) -> None:
         """Log trajectories, map and verdicts of a run folder, if there are any, and finish the file."""
-        paths = (("odometry", GREY), ("optimized", BLUE))
-        for name, colour in paths:
+        for name, colour in (("odometry", GREY), ("optimized", BLUE)):
             path = folder / f"trajectory_{name}.tum"
             if path.is_file() and path.stat().st_size:
                 driven = read_tum(path)
@@ -90,6 +93,7 @@ class RerunLog:
                 self._log.log(f"trajectory/{name}", line, static=True)
                 if name == "optimized":
                     self._show_map(folder, driven)
+        self._scans.close()
         self._log.flush()
         self._log.disconnect()
 
@@ -97,9 +101,11 @@ class RerunLog:
         """Log the ground, and closures and absolute measurements by state, at the poses of the trajectory."""
         settings, rerun = self._terrain, self._rerun
         voxels = VoxelMap(settings.cell_m)
-        poses, known = driven.at(np.array(list(self._scans), np.int64))
-        scans = [(*scan, pose) for scan, pose in zip(self._scans.values(), poses, strict=True)]
-        voxels.add([scan for scan, is_known in zip(scans, known, strict=True) if is_known])
+        poses, known = driven.at(np.array(self._stamps, np.int64))
+        self._scans.seek(0)
+        for first in range(0, len(poses), BATCH):
+            scans = [(np.load(self._scans), np.load(self._scans), pose) for pose in poses[first : first + BATCH]]
+            voxels.add([scan for scan, is_known in zip(scans, known[first : first + BATCH], strict=True) if is_known])
         points = voxels.points()
         if len(points):
             grid = make_grid(points.astype(float), settings)
@@ -109,7 +115,8 @@ class RerunLog:
             colours = [GRID_COLOURS[value] for value in grid.cells[rows, columns].tolist()]
             self._log.log("map/cloud", rerun.Points3D(points, radii=0.05, colors=[GREY]), static=True)
             self._log.log("map/grid", rerun.Points3D(cells, radii=grid.cell_m / 2, colors=colours), static=True)
-        verdicts = read_verdicts(folder / "graph_verdicts.csv", _closures(folder))
+        closures = folder / "closures.csv"
+        verdicts = read_verdicts(folder / "graph_verdicts.csv", read_closures(closures) if closures.is_file() else ())
         ends = {key: one.state for key, one in verdicts.items()}
         measured = read_verdict_states(folder / "absolute_verdicts.csv")
         for state, colour in STATE_COLOURS.items():
@@ -126,7 +133,9 @@ class RerunLog:
         if pose is None:
             return
         self._places[keyframe.stamp_ns] = pose[:3, 3]
-        self._scans[keyframe.stamp_ns] = keyframe.points, keyframe.body_T_lidar
+        self._stamps.append(keyframe.stamp_ns)
+        np.save(self._scans, keyframe.points)
+        np.save(self._scans, keyframe.body_T_lidar)
         rerun = self._rerun
         self._log.log("rover", rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         step = max(len(keyframe.points) // MOST_POINTS, 1)
@@ -138,9 +147,3 @@ class RerunLog:
         ]
         if ends:
             self._log.log(f"closures/{keyframe.stamp_ns}", rerun.LineStrips3D(ends, colors=[GREEN]))
-
-
-def _closures(folder: Path) -> list[LoopClosure]:
-    """Return the closures of a run folder."""
-    path = folder / "closures.csv"
-    return read_closures(path) if path.is_file() else []

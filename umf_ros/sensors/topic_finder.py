@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import NamedTuple
 
 from umf_ros.core.config import TRANSFORMS, Settings, Topics, load_preset, topics_of
 from umf_ros.core.errors import ConfigError, either
@@ -25,22 +24,10 @@ def is_own(topic: str) -> bool:
     return any(own in topic for own in _OWN)
 
 
-class FoundTopics(NamedTuple):
-    """Topics by input, and the candidates of inputs for which there are several, which have no topic."""
-
-    topics: Topics
-    ambiguous: dict[str, list[str]]
-
-    def only(self, wanted: Collection[str]) -> Topics:
-        """The topics; a `ConfigError` that lists the candidates where a wanted one is ambiguous."""
-        several = [f"{name}: {either(topics)}" for name, topics in self.ambiguous.items() if name in wanted]
-        if several:
-            raise ConfigError(f"several topics fit, name one of each as topics.NAME: {'; '.join(several)}")
-        return self.topics
-
-
-def find_topics(types: Mapping[str, str]) -> FoundTopics:
+def find_topics(types: Mapping[str, str]) -> tuple[Topics, dict[str, list[str]]]:
     """Choose the topic of each input by message type (`types` by topic): the only one, or none.
+
+    The candidates of inputs for which there are several are returned too, by input.
 
     An image is of the camera in whose namespace it is. Two cameras are a pair where one is called right as the other
     is called left. Cameras without a camera_info count where no camera has one.
@@ -59,7 +46,7 @@ def find_topics(types: Mapping[str, str]) -> FoundTopics:
         ambiguous["left_image"] = [cameras[camera] for camera in seeing]
     for side, camera in (("left", left), ("right", right)):
         chosen[f"{side}_image"], chosen[f"{side}_info"] = cameras.get(camera, ""), infos.get(camera, "")
-    return FoundTopics(Topics(**chosen), ambiguous)
+    return Topics(**chosen), ambiguous
 
 
 def _cameras(images: Mapping[str, str]) -> dict[str | None, str]:
@@ -120,7 +107,10 @@ def with_topics(settings: Settings, types: Mapping[str, str], wanted: Collection
         ConfigError: several topics fit.
     """
     named = settings.topics.model_fields_set
-    topics = find_topics(types).only(set(wanted) - named)
+    topics, ambiguous = find_topics(types)
+    several = [f"{name}: {either(topics)}" for name, topics in ambiguous.items() if name in set(wanted) - named]
+    if several:
+        raise ConfigError(f"several topics fit, name one of each as topics.NAME: {'; '.join(several)}")
     own = {name: getattr(settings.topics, name) for name in named}
     update = {"topics": topics.model_copy(update=own), "calibration": settings.calibration or TRANSFORMS}
     return settings.model_copy(update=update)

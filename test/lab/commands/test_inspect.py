@@ -17,8 +17,7 @@ from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, START_NS, Entry, camera_inf
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
-from umf_ros.bags.reader import open_bag
-from umf_ros.bags.storages import message_types
+from umf_ros.bags.reader import message_types, open_bag
 from umf_ros.core.config import load_settings
 from umf_ros.core.errors import BagError
 from umf_ros.core.geometry import make_pose, to_quaternion

@@ -7,8 +7,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from umf_ros.bags.reader import open_bag
-from umf_ros.bags.storages import message_types
+from umf_ros.bags.reader import message_types, open_bag
 from umf_ros.core.errors import OutputError
 from umf_ros.lab.simulation.bag_writer import BagWriter
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.typesys import Stores, get_typestore
 
-from umf_ros.bags.storages import message_types
+from umf_ros.bags.reader import message_types
 from umf_ros.core.errors import OutputError, writing
 from umf_ros.core.frames import StereoCamera
 from umf_ros.core.geometry import Array, to_quaternion
