@@ -31,7 +31,7 @@ COMMANDS = {
     "why": "umf_ros.lab.commands.report:why",
     "explain": "umf_ros.lab.commands.compare:explain",
     "train": "umf_ros.lab.commands.train",
-    "export": "umf_ros.lab.commands.export",
+    "export": "umf_ros.lab.commands.train:export",
     "bench": "umf_ros.lab.commands.bench:app",
     "doctor": "umf_ros.commands.doctor",
     "pretrain": "umf_ros.lab.commands.train:app",

@@ -8,7 +8,7 @@ import pytest
 from conftest import make_frame
 
 from umf_ros.core.errors import BagError
-from umf_ros.lab.evaluation.comparison import nearest_frames, parse_moment, split_reference
+from umf_ros.lab.evaluation.place_views import nearest_frames, parse_moment, split_reference
 
 FRAMES = [make_frame(1_625_680_800 + 0.25 * number) for number in range(40)]
 

@@ -12,7 +12,7 @@ import small_gicp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.frames import Frame, Image, Points
+from umf_ros.core.frames import Frame, Image
 from umf_ros.core.geometry import Array, cubes, invert
 from umf_ros.core.trajectory import Trajectory, interpolated
 from umf_ros.embedding.depth import disparities

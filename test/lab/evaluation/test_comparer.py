@@ -17,10 +17,10 @@ from umf_ros.lab.evaluation.comparison import (
     NO_CALIBRATION,
     NO_DEPTH,
     Comparer,
-    PlaceView,
     judge,
     similarity_of,
 )
+from umf_ros.lab.evaluation.place_views import PlaceView, ViewReader
 from umf_ros.lab.scan_files import SensorFileError
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image
 from umf_ros.verification import Verifier
@@ -30,7 +30,7 @@ MATCH, QUERY = (without_image(take(GROUND, pose_at(GROUND, x, 0.0, 0.0), 10.0)) 
 
 
 def comparer(calibration: Path | None = None) -> Comparer:
-    return Comparer(ThumbnailEmbedder(), Verification(), calibration=calibration)
+    return Comparer(ViewReader(ThumbnailEmbedder(), calibration), Verification())
 
 
 @pytest.fixture

@@ -15,11 +15,11 @@ from umf_ros.lab.evaluation.comparison import (
     POSE,
     RESULT_COLUMNS,
     SIGMA,
-    PlaceView,
     read_pairs,
     result_row,
     view_row,
 )
+from umf_ros.lab.evaluation.place_views import PlaceView
 
 
 def listed(folder: Path, text: str) -> Path:

@@ -16,8 +16,9 @@ from umf_ros.core.config import Verification
 from umf_ros.core.errors import CalibrationError, UmfError
 from umf_ros.core.frames import Embedding, Frame
 from umf_ros.core.geometry import invert, make_pose, relative, transform
-from umf_ros.lab.evaluation import comparison as views
-from umf_ros.lab.evaluation.comparison import Comparer, PlaceView, judge
+from umf_ros.lab.evaluation import place_views
+from umf_ros.lab.evaluation.comparison import Comparer, judge
+from umf_ros.lab.evaluation.place_views import PlaceView, ViewReader
 from umf_ros.lab.scan_files import SensorFileError
 from umf_ros.verification import Verifier
 
@@ -46,7 +47,7 @@ def here(tmp_path: Path) -> Path:
 
 def test_a_scan_alone_is_in_the_body_frame(here: Path) -> None:
     embedder = CountingEmbedder()
-    keyframe = Comparer(embedder, Verification()).keyframe(PlaceView(str(here / "scan.npy")))
+    keyframe = ViewReader(embedder).keyframe(PlaceView(str(here / "scan.npy")))
     (frame,) = embedder.frames
     np.testing.assert_array_equal(frame.points, np.load(here / "scan.npy")[:, :3])
     np.testing.assert_array_equal(keyframe.body_T_lidar, np.eye(4))
@@ -54,7 +55,7 @@ def test_a_scan_alone_is_in_the_body_frame(here: Path) -> None:
 
 def test_with_a_calibration_images_belong_to_it(here: Path) -> None:
     embedder = CountingEmbedder()
-    source = Comparer(embedder, Verification(), calibration=here / "calibration.yaml")
+    source = ViewReader(embedder, calibration=here / "calibration.yaml")
     image = str(here / "left.png")
     source.keyframe(PlaceView(str(here / "scan.npy"), image, image))
     (frame,) = embedder.frames
@@ -65,7 +66,7 @@ def test_with_a_calibration_images_belong_to_it(here: Path) -> None:
 def test_without_one_they_are_left_aside_and_it_says_so_once(here: Path) -> None:
     told: list[str] = []
     embedder = CountingEmbedder()
-    source = Comparer(embedder, Verification(), warn=told.append)
+    source = ViewReader(embedder, warn=told.append)
     for right in ("", "other.png"):
         source.keyframe(PlaceView(str(here / "scan.npy"), str(here / "left.png"), right))
     assert [frame.left for frame in embedder.frames] == [None, None]
@@ -73,9 +74,9 @@ def test_without_one_they_are_left_aside_and_it_says_so_once(here: Path) -> None
 
 
 def test_a_view_in_many_pairs_is_embedded_once(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(views, "CACHED_KEYFRAMES", 2)
+    monkeypatch.setattr(place_views, "CACHED_KEYFRAMES", 2)
     embedder = CountingEmbedder()
-    source = Comparer(embedder, Verification(), calibration=here / "calibration.yaml")
+    source = ViewReader(embedder, calibration=here / "calibration.yaml")
     one, two = PlaceView(str(here / "scan.npy")), PlaceView("", str(here / "left.png"))
     three = PlaceView(str(here / "drive.mcap@1"))
     for view in (one, two, one, one, two):
@@ -90,14 +91,14 @@ def test_a_view_in_many_pairs_is_embedded_once(here: Path, monkeypatch: pytest.M
 
 def test_a_recording_is_read_once_for_all_that_is_expected_of_it(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[Path] = []
-    really_open = views.open_bag
+    really_open = place_views.open_bag
 
     def count(path: Path) -> object:
         opened.append(path)
         return really_open(path)
 
-    monkeypatch.setattr(views, "open_bag", count)
-    source = Comparer(ThumbnailEmbedder(), Verification(), calibration=here / "calibration.yaml")
+    monkeypatch.setattr(place_views, "open_bag", count)
+    source = ViewReader(ThumbnailEmbedder(), calibration=here / "calibration.yaml")
     asked = [PlaceView(f"{here}/drive.mcap@{second}") for second in (2, 0.5, 1, 0.5, 99)]
     source.expect(asked)
     stamps = [source.keyframe(view).stamp_ns for view in asked[:4]]
@@ -124,7 +125,7 @@ def test_a_recording_is_read_once_for_all_that_is_expected_of_it(here: Path, mon
     ],
 )
 def test_what_cannot_be_read_is_said_every_time(here: Path, view: PlaceView, text: str) -> None:
-    source = Comparer(ThumbnailEmbedder(), Verification(), calibration=here / "calibration.yaml")
+    source = ViewReader(ThumbnailEmbedder(), calibration=here / "calibration.yaml")
     there = PlaceView(*(str(here / name) if name else "" for name in (view.scan, view.left, view.right)))
     for _ in range(2):
         with pytest.raises(UmfError, match=text):
@@ -135,18 +136,18 @@ def test_what_cannot_be_read_is_said_every_time(here: Path, view: PlaceView, tex
 def test_a_scan_in_another_unit_or_frame_is_none(here: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     np.save(here / "scan.npy", change(np.load(here / "scan.npy")))
     with pytest.raises(SensorFileError, match=r"scan\.npy has no return within reach: expected metres"):
-        Comparer(ThumbnailEmbedder(), Verification()).keyframe(PlaceView(str(here / "scan.npy")))
+        ViewReader(ThumbnailEmbedder()).keyframe(PlaceView(str(here / "scan.npy")))
 
 
 def test_a_calibration_that_cannot_be_read_is_said_at_once(here: Path) -> None:
     with pytest.raises(CalibrationError, match="cannot read"):
-        Comparer(ThumbnailEmbedder(), Verification(), calibration=here / "nowhere.yaml")
+        ViewReader(ThumbnailEmbedder(), calibration=here / "nowhere.yaml")
 
 
 def test_a_data_set_names_its_calibration(here: Path) -> None:
     embedder = CountingEmbedder()
     cv2.imwrite(str(here / "left.png"), np.zeros((512, 688), np.uint8))
-    Comparer(embedder, Verification(), calibration=Path("simulated")).keyframe(PlaceView("", str(here / "left.png")))
+    ViewReader(embedder, calibration=Path("simulated")).keyframe(PlaceView("", str(here / "left.png")))
     assert embedder.frames[0].camera.fx > 300
 
 
@@ -172,14 +173,15 @@ def test_frames_seen_from_opposite_sides_by_a_narrow_lidar_are_compared_as_subma
     (tmp_path / "calibration.yaml").write_text(CALIBRATION.replace("offset_s: 0.1", "offset_s: 0.0"))
     bag = recorded(tmp_path / "drive.mcap", outing, with_odometry)
     there, back, near = 18, len(outing.keyframes) - 18, 22
-    source = Comparer(ThumbnailEmbedder(), Verification(), calibration=tmp_path / "calibration.yaml")
+    source = ViewReader(ThumbnailEmbedder(), calibration=tmp_path / "calibration.yaml")
     views = [PlaceView(f"{bag}@{START_NS + outing.keyframes[row].stamp_ns}") for row in (there, back, near)]
     source.expect(views)
-    row = source.compare(*views[:2])
+    comparer = Comparer(source, Verification())
+    row = comparer.compare(*views[:2])
     assert row["accepted"] == with_odometry
     if with_odometry:
         true = relative(outing.truth[there], outing.truth[back])
         assert np.hypot(row["x"] - true[0, 3], row["y"] - true[1, 3]) < 0.5 and abs(row["qz"]) > 0.99
     # submaps of neighbours hold the same scans: they are compared by their own
     alone = judge(Verifier(Verification()), source.keyframe(views[0]), source.keyframe(views[2]))
-    assert source.compare(views[0], views[2])["probability"] == pytest.approx(alone.probability, abs=1e-6)
+    assert comparer.compare(views[0], views[2])["probability"] == pytest.approx(alone.probability, abs=1e-6)

@@ -15,7 +15,8 @@ from umf_ros.core.errors import BagError, ConfigError, OutputError, UmfError, on
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.lab.evaluation.comparison import Comparer, Moment, Pair, PlaceView, Row
+    from umf_ros.lab.evaluation.comparison import Comparer, Pair, Row
+    from umf_ros.lab.evaluation.place_views import Moment, PlaceView
 
 Image = Annotated[Path | None, typer.Option(help="Image file; needs --calibration.", show_default=False)]
 ViewName = Annotated[
@@ -62,6 +63,7 @@ def command(
     from umf_ros.core.config import load_settings
     from umf_ros.detector import make_detector_embedder
     from umf_ros.lab.evaluation.comparison import Comparer, read_pairs
+    from umf_ros.lab.evaluation.place_views import ViewReader
 
     if pairs is not None:
         asked = read_pairs(pairs)
@@ -70,16 +72,16 @@ def command(
     method = {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}
     settings = load_settings(config, **method)
     errors = Console(stderr=True)
-    comparer = Comparer(
+    views = ViewReader(
         make_detector_embedder(settings),
-        settings.verification,
         calibration,
         bin_columns,
         config,
         dataset,
         warn=lambda text: errors.print(text, **WARNING),
     )
-    comparer.expect(view for pair in asked for view in pair)
+    views.expect(view for pair in asked for view in pair)
+    comparer = Comparer(views, settings.verification)
     if pairs is not None and out is not None:
         _compare_list(comparer, asked, pairs.parent, out, errors)
     else:
@@ -96,7 +98,7 @@ def _check_named(match: str | Path | None, query: str | Path | None, out: Path |
 
 
 def _view(name: str | None, left: Path | None, right: Path | None) -> PlaceView:
-    from umf_ros.lab.evaluation.comparison import PlaceView
+    from umf_ros.lab.evaluation.place_views import PlaceView
     from umf_ros.lab.scan_files import IMAGE_SUFFIXES
 
     scan, images = name or "", [str(path) if path else "" for path in (left, right)]
@@ -177,8 +179,9 @@ def explain(
     from umf_ros.bags.frames import FrameReader
     from umf_ros.detector import assemble, make_detector_embedder
     from umf_ros.embedding.depth import lift
-    from umf_ros.lab.evaluation.comparison import draw, nearest_frames
+    from umf_ros.lab.evaluation.comparison import draw
     from umf_ros.lab.evaluation.comparison import explain as explained
+    from umf_ros.lab.evaluation.place_views import nearest_frames
 
     console = Console()
     moments = [_moment(text) for text in (query, match)]
@@ -202,7 +205,7 @@ def explain(
 
 
 def _moment(text: str) -> Moment:
-    from umf_ros.lab.evaluation.comparison import parse_moment
+    from umf_ros.lab.evaluation.place_views import parse_moment
 
     try:
         return parse_moment(text)

@@ -98,7 +98,7 @@ def why(
 
 
 def _stamp(text: str, start_ns: int) -> int:
-    from umf_ros.lab.evaluation.comparison import parse_moment
+    from umf_ros.lab.evaluation.place_views import parse_moment
 
     try:
         moment = parse_moment(text)
