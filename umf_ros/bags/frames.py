@@ -145,10 +145,7 @@ def read_transforms(bag: Bag) -> StaticTransforms:
 def _absolute_topics(settings: Settings, bag: Bag) -> dict[str, Aid]:
     """Return the topics of absolute measurements; raise a `BagError` if a named one is missing or of another type."""
     found = {}
-    for source, topic in (
-        (Aid.GNSS, settings.absolute.gnss),
-        (Aid.GRAVITY, settings.absolute.imu),
-    ):
+    for source, topic in ((Aid.GNSS, settings.absolute.gnss), (Aid.GRAVITY, settings.absolute.imu)):
         if not topic:
             continue
         info = bag.topics.get(topic)

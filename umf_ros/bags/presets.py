@@ -28,10 +28,10 @@ def detect_dataset(bag: Bag, own_calibration: bool = False) -> str:
         BagError: the recording is of no known data set.
     """
     best = known_dataset(bag.topics)
-    reason = "" if own_calibration or not best else _contradiction(bag, best)
     if not best:
-        reason = f"the recording has no topic of a known data set (topics: {', '.join(sorted(bag.topics)) or 'none'})"
-    if reason:
+        topics = ", ".join(sorted(bag.topics)) or "none"
+        raise BagError(f"the recording has no topic of a known data set (topics: {topics})")
+    if not own_calibration and (reason := _contradiction(bag, best)):
         raise BagError(reason)
     return best
 

@@ -272,7 +272,7 @@ def lay_over(equations: list[Array]) -> Overlay | None:
 MIN_STEP_S, MAX_STEP_S = 0.18, 1.0  # by hand: between frames whose motion is compared
 MAX_STEPS = 150  # by hand: bounds the time
 MOVES_M = 0.03  # by hand: a parked rover carries no information on clocks
-DEPTH_EVERY, DEPTH_FRAMES, DEPTH_POINTS = 4, 60, 400  # by hand: bounds the time
+DEPTH_EVERY, DEPTH_FRAMES, DEPTH_POINTS = 4, 60, 400  # by hand: bounds the time; images too are of every 4th frame
 DEPTH_RANGE_M = (2.0, 15.0)  # by hand: where a third of a pixel is a few per cent of the depth
 
 
@@ -316,8 +316,13 @@ class SensorCheck:
     def take(self, frame: Frame) -> None:
         """Add one frame, in the order of the stamps."""
         self._frames += 1
-        self._look(frame)
+        if frame.points is not None:
+            self._returns.append(float(len(frame.points)))
+            if frame.intensity is not None and len(frame.intensity):
+                self._intensity_max = float(np.fmax(self._intensity_max, frame.intensity.max()))
         if self._frames % DEPTH_EVERY == 1:
+            for image, contrasts in zip((frame.left, frame.right), self._contrasts, strict=True):
+                contrasts += [] if image is None else [float(image[::4, ::4].std())]
             self.compare_depths(frame)
         waited_s = MIN_STEP_S if self._last is None else (frame.stamp_ns - self._last.stamp_ns) * 1e-9
         if waited_s < MIN_STEP_S:
@@ -334,16 +339,6 @@ class SensorCheck:
             return found
         lidar, camera = (compare_motion(steps, odometry) for steps in (self._scan_steps, self._view_steps))
         return replace(found, lidar=lidar, camera=camera, forward=_forward(odometry))
-
-    def _look(self, frame: Frame) -> None:
-        if self._frames % 4 == 1:
-            for image, contrasts in zip((frame.left, frame.right), self._contrasts, strict=True):
-                if image is not None:
-                    contrasts.append(float(image[::4, ::4].std()))
-        if frame.points is not None:
-            self._returns.append(float(len(frame.points)))
-            if frame.intensity is not None and len(frame.intensity):
-                self._intensity_max = float(np.fmax(self._intensity_max, frame.intensity.max()))
 
     def compare_depths(self, frame: Frame) -> None:
         """Compare stereo disparities with the scan in the common field of view."""

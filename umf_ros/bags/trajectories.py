@@ -37,7 +37,7 @@ def read_tum(path: str | Path) -> Trajectory:
         if not fields or line.lstrip().startswith("#"):
             continue
         try:
-            stamp, row = _to_ns(fields[0]), [float(field) for field in fields[1:]]
+            stamp, row = _checked(int(Decimal(fields[0]) * 10**9)), [float(field) for field in fields[1:]]
         except (ValueError, ArithmeticError):
             raise BagError(f"{path}, line {number}: expected numbers, found {line.strip()[:60]!r}") from None
         if len(row) != 7:
@@ -91,15 +91,6 @@ def decode_ground_truth(bag: Bag, messages: Iterable[RawMessage]) -> Trajectory 
         return Trajectory.rising((stamp_ns(one), decode_pose(one.pose)) for one in found)
     except MessageError as error:
         raise BagError(f"{bag.path}: ground truth holds a {error}") from None
-
-
-def _to_ns(seconds: str) -> int:
-    """Return nanoseconds of decimal seconds, without the rounding of a float.
-
-    Raises:
-        ArithmeticError: it is not a number, or out of range.
-    """
-    return _checked(int(Decimal(seconds) * 10**9))
 
 
 def _checked(nanoseconds: int) -> int:

@@ -8,7 +8,7 @@ import os
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import chain, count
@@ -79,22 +79,16 @@ def create_run_folder(out: Path, latest: bool = True) -> Path:
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     with writing(f"to {out}"):
         out.mkdir(parents=True, exist_ok=True)
-        names = (stamp if number == 1 else f"{stamp}_{number}" for number in count(1))
-        folder = next(folder for name in names if _is_new(folder := out / name))
+        for number in count(1):
+            folder = out / (stamp if number == 1 else f"{stamp}_{number}")
+            with suppress(FileExistsError):
+                folder.mkdir()
+                break
         if latest:  # atomic, so that the link never dangles
             fresh = out / f".latest-{os.getpid()}"
             fresh.symlink_to(folder.name, target_is_directory=True)
             fresh.replace(out / "latest")
     return folder
-
-
-def _is_new(folder: Path) -> bool:
-    """Make a folder; return false if the name exists."""
-    try:
-        folder.mkdir()
-    except FileExistsError:
-        return False
-    return True
 
 
 def lock_file(path: Path) -> int:

@@ -41,7 +41,7 @@ def level(points: Points, keep_slope: bool = False) -> Array:
     cloud = small_gicp.voxelgrid_sampling(known, CELL_M)
     small_gicp.estimate_normals(cloud, num_neighbors=NEIGHBOURS, num_threads=1)
     normals = np.asarray(cloud.normals())[:, :3]
-    turn, trust = _upright(normals)
+    turn, trust = upright(normals)
     levelled = np.asarray(cloud.points())[:, :3] @ turn.T
     flat = (np.abs(normals @ turn[2]) > GROUND_COS) & (np.hypot(levelled[:, 0], levelled[:, 1]) < GROUND_M)
     height = float(np.quantile(levelled[flat, 2], GROUND_SHARE)) if flat.sum() >= MIN_GROUND_POINTS else 0.0
@@ -57,21 +57,17 @@ def _of_mount(turn: Array) -> Array:
     return found
 
 
-def upright(normals: Array) -> Array:
+def upright(normals: Array) -> tuple[Array, float]:
     """Return the rotation (3, 3) that sets a scan upright, so that two scans differ by a heading and a little tilt.
 
     The upright direction is nearly parallel to the normals of the ground and nearly square to those of walls. Starting
     from the body's own z axis, normals near either are counted in and the others left out, in a cone that narrows step
-    by step. As far as the normals do not determine a direction, the body's z axis is kept.
+    by step. As far as the normals do not determine a direction, the body's z axis is kept; how well they do is returned
+    too, 0 to 1.
 
     Args:
         normals: (N, 3) unit normals of either sign, zero where unknown; body frame.
     """
-    return _upright(normals)[0]
-
-
-def _upright(normals: Array) -> tuple[Array, float]:
-    """Return the rotation, and how well the normals determine it, 0 to 1."""
     normals = normals[np.einsum("ij,ij->i", normals, normals) > 0.5]
     up, trust = np.array([0.0, 0.0, 1.0]), 0.0
     for cone in CONES:

@@ -40,7 +40,16 @@ def lift_features(frame: Frame, features: LocalFeatures) -> LocalFeatures:
 
     Depth from the LiDAR (2 cm, day and night) takes precedence over stereo.
     """
-    return dataclasses.replace(features, points=_locate(frame, features))
+    depth = _lidar_depths(frame, features.positions)
+    unknown = np.flatnonzero(~np.isfinite(depth))
+    camera = frame.camera
+    if len(unknown) and frame.left is not None and frame.right is not None and camera.baseline > 0:
+        disparity = disparities(frame.left, frame.right, features.positions[unknown], camera)
+        depth[unknown] = camera.fx * camera.baseline / disparity
+    u, v = features.positions.T.astype(float)
+    ray = np.column_stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))])
+    points = transform(frame.body_T_camera, ray * depth[:, None]).astype(np.float32)
+    return dataclasses.replace(features, points=points)
 
 
 def disparities(left: Image, right: Image, pixels: Array, camera: StereoCamera) -> Array:
@@ -79,18 +88,6 @@ def _rough_disparities(left: Image, right: Image, pixels: Array, camera: StereoC
     column, row = np.clip(cells, 0, np.array(size) - 1).T
     disparity = found[row, column] * (HALF / 16.0)  # fixed point, sixteenths of a pixel
     return np.where(disparity > 0, disparity, np.nan)
-
-
-def _locate(frame: Frame, features: LocalFeatures) -> Points:
-    depth = _lidar_depths(frame, features.positions)
-    unknown = np.flatnonzero(~np.isfinite(depth))
-    camera = frame.camera
-    if len(unknown) and frame.left is not None and frame.right is not None and camera.baseline > 0:
-        disparity = disparities(frame.left, frame.right, features.positions[unknown], camera)
-        depth[unknown] = camera.fx * camera.baseline / disparity
-    u, v = features.positions.T.astype(float)
-    ray = np.column_stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))])
-    return transform(frame.body_T_camera, ray * depth[:, None]).astype(np.float32)
 
 
 def _lidar_depths(frame: Frame, pixels: Points) -> Array:

@@ -176,11 +176,9 @@ class RunFile:
         """Return the odometry of the run in the order of arrival."""
         found = []
         with self._file.reading() as connection:
-            # files of an earlier release have no column of covariances
-            for _, stamp_ns, data, *spread in connection.execute("SELECT * FROM odometry ORDER BY number"):
+            for _, stamp_ns, data, spread in connection.execute("SELECT * FROM odometry ORDER BY number"):
                 pose = np.vstack([np.frombuffer(data, np.float64).reshape(3, 4), (0, 0, 0, 1)])
-                tracked = bool(spread) and spread[0] is not None
-                covariance = np.frombuffer(spread[0], np.float64).reshape(6, 6) if tracked else None
+                covariance = None if spread is None else np.frombuffer(spread, np.float64).reshape(6, 6)
                 found.append(OdometrySample(int(stamp_ns), pose, covariance))
         return found
 
@@ -189,10 +187,9 @@ class RunFile:
         inputs: list[tuple[int, GraphInput]] = []
         with self._file.reading() as connection:
             before = connection.execute("SELECT odometry_before FROM closures ORDER BY rowid").fetchall()
-            if connection.execute("SELECT name FROM sqlite_master WHERE name = 'absolute'").fetchone():
-                for source, stamp_ns, number, data in connection.execute("SELECT * FROM absolute ORDER BY rowid"):
-                    numbers = np.frombuffer(data, np.float64)
-                    inputs.append((number, AbsoluteMeasurement.stored(source, stamp_ns, numbers)))
+            for source, stamp_ns, number, data in connection.execute("SELECT * FROM absolute ORDER BY rowid"):
+                numbers = np.frombuffer(data, np.float64)
+                inputs.append((number, AbsoluteMeasurement.stored(source, stamp_ns, numbers)))
         inputs += zip((number for (number,) in before), self.closures(), strict=True)
         waiting = deque(sorted(inputs, key=lambda one: one[0]))
         for number, odometry in enumerate(self.odometry()):
@@ -208,11 +205,10 @@ class RunFile:
             return {int(stamp): np.frombuffer(data, np.float16).astype(np.float32) for stamp, data in rows}
 
     def pictures(self) -> Iterator[Picture]:
-        """Yield the pictures of the keyframes; none in files of an earlier release."""
+        """Yield the pictures of the keyframes."""
         with self._file.reading() as connection:
-            if connection.execute("SELECT name FROM sqlite_master WHERE name = 'picture'").fetchone():
-                for stamp_ns, jpeg, width, height, scan in connection.execute("SELECT * FROM picture ORDER BY rowid"):
-                    yield Picture(stamp_ns, jpeg, width, height, np.frombuffer(scan, "<i2").reshape(-1, 3))
+            for stamp_ns, jpeg, width, height, scan in connection.execute("SELECT * FROM picture ORDER BY rowid"):
+                yield Picture(stamp_ns, jpeg, width, height, np.frombuffer(scan, "<i2").reshape(-1, 3))
 
     def export(self, localizing: bool = False) -> None:
         """Write the CSV tables; that of poses in a map also without rows if the run is localising."""

@@ -146,7 +146,7 @@ class PreparedScan:
     @cached_property
     def up(self) -> Array:
         """Rotation (3, 3) that sets the scan upright."""
-        return upright(self.normals[self.picks])
+        return upright(self.normals[self.picks])[0]
 
     @property
     def upright_T_body(self) -> Array:
