@@ -64,11 +64,9 @@ class Trajectory:
         for stamp_ns, pose in samples:
             if not kept or stamp_ns > kept[-1][0]:
                 kept.append((stamp_ns, pose))
-        return (
-            cls(np.array([stamp for stamp, _ in kept], np.int64), np.stack([pose for _, pose in kept]))
-            if kept
-            else None
-        )
+        if not kept:
+            return None
+        return cls(np.array([stamp for stamp, _ in kept], np.int64), np.stack([pose for _, pose in kept]))
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

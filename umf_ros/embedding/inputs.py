@@ -122,10 +122,8 @@ def _features(occupied: NDArray[np.int64], means: Points) -> Points:
 def _fold(occupied: NDArray[np.int64], features: Points) -> Points:
     half = CELLS // 2
     corner = _corner(occupied)
-    parent, child = (
-        np.ravel_multi_index(tuple(corner // 2), (half,) * 3),
-        np.ravel_multi_index(tuple(corner % 2), (2,) * 3),
-    )
+    parent = np.ravel_multi_index(tuple(corner // 2), (half,) * 3)
+    child = np.ravel_multi_index(tuple(corner % 2), (2,) * 3)
     grid = np.zeros((half**3, FEATURES, 8), np.float32)
     grid[parent, :, child] = features.T
     return grid.reshape(half, half, half, FEATURES * 8)

@@ -14,7 +14,7 @@ from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,22 +37,6 @@ FACTS = "umf_ros"
 """Section of a model's `rt_info`: `precision`, and `weights`, the SHA-256 of the weights it was made from."""
 
 
-class Runtime(Protocol):
-    """Protocol of an inference runtime.
-
-    Attributes:
-        precision: "float32" or "int8".
-        file: the outputs depend on its content.
-    """
-
-    precision: str
-    file: Path
-
-    def run(self, inputs: Arrays) -> Outputs:
-        """Return the outputs of a batch of one by name, without the batch axis."""
-        ...
-
-
 class OpenVinoRuntime:
     """OpenVINO on the CPU; layers that are not quantised run in single precision.
 
@@ -60,6 +44,10 @@ class OpenVinoRuntime:
         weights: the model lies beside this file.
         outputs: names of the outputs to compute.
         threads: number of CPU threads.
+
+    Attributes:
+        precision: "float32" or "int8".
+        file: the outputs depend on its content.
 
     Raises:
         WeightsError: the model is damaged, or was made from other weights.
@@ -84,7 +72,7 @@ class OpenVinoRuntime:
         self._model = openvino_core().compile_model(model, "CPU", options | _cache_options())
 
     def run(self, inputs: Arrays) -> Outputs:
-        """Return the outputs of a batch of one; see `Runtime`."""
+        """Return the outputs of a batch of one by name, without the batch axis."""
         found = self._model(list(inputs))
         return {port.any_name: found[port][0].astype(np.float32) for port in self._model.outputs}
 
@@ -123,11 +111,14 @@ class TorchRuntime:
             raise ConfigError(f"embedding.device: cannot use {device!r}: {str(error).splitlines()[0]}") from None
 
     def run(self, inputs: Arrays) -> Outputs:
-        """Return the outputs of a batch of one; see `Runtime`."""
+        """Return the outputs of a batch of one by name, without the batch axis."""
         with self._torch.inference_mode():
             found = self._network(*(self._torch.from_numpy(array).to(self._device) for array in inputs))
         values = (value[0].float().cpu().numpy() for value in found)
         return dict(zip(self._outputs, values, strict=True))
+
+
+Runtime = OpenVinoRuntime | TorchRuntime
 
 
 def outputs_of(asked: FeatureRequest) -> tuple[str, ...]:

@@ -124,9 +124,8 @@ def _graph(about: JudgedRun) -> Iterator[Advice]:
     if pending and not states[State.ACCEPTED]:
         reason = Counter(one.reason for one in verdicts if one.state != State.ACCEPTED).most_common(1)[0][0]
         what = f"all closures are pending: the graph used none of {total} ({reason})"
-        yield Advice(
-            "fault", f"{what}, so the optimised trajectory is the odometry", f"{REACH}; pending is not rejected"
-        )
+        what += ", so the optimised trajectory is the odometry"
+        yield Advice("fault", what, f"{REACH}; pending is not rejected")
         return
     worse = "odometry worse than pose_graph.odometry_sigma_m and odometry_sigma_deg say, or wrong closures: click some"
     for state, remedy in ((State.REJECTED, worse), (State.REFUSED, REACH)):
@@ -387,9 +386,8 @@ def _used(about: JudgedRun) -> str:
     total, accepted, pending = states.total(), states[State.ACCEPTED], states[State.PENDING]
     if not total:
         return ""
-    rest = [
-        f"{count} {word}" for count, word in ((pending, "pending"), (total - accepted - pending, "rejected")) if count
-    ]
+    others = (pending, "pending"), (total - accepted - pending, "rejected")
+    rest = [f"{count} {word}" for count, word in others if count]
     used = "all of them" if accepted == total else f"{accepted or 'none'} of them"
     return f"the graph used {used}" + (f" ({', '.join(rest)})" if rest else "")
 
