@@ -120,3 +120,11 @@ def test_pillars_that_come_again_to_any_side_are_rivals() -> None:
         query, match = (seen(box((-30, 30), (-30, 30), 3.0, pillars), np.eye(4), 9.0) for _ in range(2))
         found.append(ambiguity(match, query, np.eye(4), 100.0 * np.eye(6))["rival_far"])
     assert found[0] < 0.15 < found[1] - 0.1
+
+
+def test_a_room_that_looks_the_same_turned_round_has_a_rival_at_the_same_place() -> None:
+    found = []
+    for pillars in ([[3.0, 1.5], [-3.0, -1.5]], [[3.0, 1.5], [-3.0, -1.5], [4.0, -2.5], [0.5, 2.5]]):
+        query, match = (seen(box((-6, 6), (-4, 4), 3.0, np.array(pillars)), np.eye(4), 9.0) for _ in range(2))
+        found.append(ambiguity(match, query, np.eye(4), 100.0 * np.eye(6))["rival_far"])
+    assert found[0] < 0.1 < found[1]

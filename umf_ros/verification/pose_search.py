@@ -97,14 +97,24 @@ def coarse_align(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
 
 
 def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
-    """Where else the query could lie at the heading of a pose, refined: the peaks but that of the pose."""
+    """Where else the query could lie at the heading of a pose or turned round, refined: the peaks but that of the pose.
+
+    Rooms often look much the same turned by 180 deg.
+    """
     level = levelled(match, query, pose)
-    theirs, ours, turn = match.map(query.cell_m), query.map(query.cell_m), float(heading(level))
-    volumes = _correlate(theirs, ours.turned_spectra(np.array([turn])))
+    theirs, ours = match.map(query.cell_m), query.map(query.cell_m)
     row, column = np.round(level[:2, 3] / query.cell_m).astype(int) + const.MAP_SHIFT
-    volumes[:, :, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
-    peaks = _peaks(volumes, np.zeros(1, np.intp), const.PEAKS // 2, query.cell_m)
-    return [_by_scouts(match, query, lifted(match, query, turn, shift)) for _, shift in peaks]
+    turns = float(heading(level)) + np.array([0.0, np.pi])
+    found = []
+    for turn, overlap in zip(turns, match.view.overlap(query.view, turns), strict=True):
+        if overlap < const.SEARCHED_OVERLAP:
+            continue
+        volumes = _correlate(theirs, ours.turned_spectra(np.array([turn])))
+        if turn == turns[0]:
+            volumes[:, :, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
+        peaks = _peaks(volumes, np.zeros(1, np.intp), const.PEAKS // 2, query.cell_m)
+        found += [_by_scouts(match, query, lifted(match, query, turn, shift)) for _, shift in peaks]
+    return found
 
 
 def _by_scouts(match: PreparedScan, query: PreparedScan, guess: Array) -> Array:

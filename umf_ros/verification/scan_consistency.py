@@ -92,7 +92,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     across = np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1]
     way = np.append(across, 0.0)
     beside, along = (shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
-    peaks = [one for one in alternatives(match, query, pose) if not near(one, pose, const.DISTINCT_M, np.inf)]
+    peaks = [one for one in alternatives(match, query, pose) if not near(one, pose, const.DISTINCT_M, np.pi / 2)]
     poses = np.stack([pose, *beside, *along, *peaks])
     misfits = _point_misfit(match, query, poses), _point_misfit(query, match, invert(poses))
     fit, far = np.log(np.maximum(sum(misfits) / 2, const.MISFIT_FLOOR)), 1 + len(beside)
