@@ -11,7 +11,7 @@ import pytest
 from packaging.version import Version
 from sources import ROOT, requirements
 
-from umf_ros.lab.commands.inspect import checks
+from umf_ros.commands.doctor import checks
 
 
 @pytest.fixture

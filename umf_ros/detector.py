@@ -349,6 +349,11 @@ class LoopDetector:
         return keyframe
 
 
+def make_keyframe(frame: Frame, embedder: Embedder, path_length_m: float = math.nan) -> Keyframe:
+    """Return the keyframe of a frame: embedded, its features lifted to 3-D, its scan thinned."""
+    return assemble(frame, lift(frame, embedder.embed(frame)), path_length_m)
+
+
 def assemble(frame: Frame, embedding: Embedding, path_length_m: float = math.nan, session: int = 0) -> Keyframe:
     """Return the keyframe of a frame whose embedding is known, its scan thinned."""
     points, motion = thin_frame(frame)

@@ -72,7 +72,9 @@ class DurableGraph:
     decided again. When the disk is full, the graph continues without its log, and `on_fault` is called with the error.
 
     Args:
+        settings: of the graph.
         path: of the log, opened when it exists; None: no log.
+        on_fault: takes the error when the log cannot be written.
         make: returns an empty graph; None: a pose graph.
 
     Attributes:

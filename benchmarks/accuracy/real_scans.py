@@ -24,9 +24,8 @@ from rich.progress import track
 
 from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Keyframe
-from umf_ros.detector import assemble
+from umf_ros.detector import make_keyframe
 from umf_ros.embedding import make_embedder
-from umf_ros.embedding.depth import lift
 from umf_ros.lab.evaluation.comparison import judge
 from umf_ros.lab.scan_files import make_snapshot, read_scan
 from umf_ros.verification import Verifier
@@ -52,7 +51,7 @@ def main(
     def keyframe(path: str) -> Keyframe:
         cloud = cropped(read_scan(folder / path), crop)
         frame = make_snapshot(cloud)
-        return assemble(frame, lift(frame, embedder.embed(frame)))
+        return make_keyframe(frame, embedder)
 
     listed = (folder / "pairs.csv").is_file()
     pairs = list(read_pairs(folder / "pairs.csv") if listed else draw_pairs(folder, keyframe, sample, apart))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.sensor_check import MIN_PAIRS, SensorCheck, SensorReport, compare_motion
+from umf_ros.bags.sensor_check import MIN_PAIRS, SensorCheck, SensorReport, Step, compare_motion
 from umf_ros.core.config import load_settings
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import make_pose, transform
@@ -20,8 +20,8 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.decode import OdometrySample
 
 
-def stamps(start: float, end: float) -> tuple[int, int]:
-    return round(start * 1e9), round(end * 1e9)
+def stamps(*seconds: float) -> list[int]:
+    return [round(second * 1e9) for second in seconds]
 
 
 Drive = tuple[list[Frame], Trajectory]
@@ -102,7 +102,7 @@ def test_a_clock_that_is_off_is_found_whatever_the_mounting(lag_s: float) -> Non
     for start, earlier, later in zip(starts, bumpy(starts), bumpy(starts + 0.25), strict=True):
         motion = np.linalg.inv(earlier) @ later
         turn = mounted.T @ Rotation.from_matrix(motion[:3, :3]).as_rotvec()
-        steps.append((stamps(start - lag_s, start + 0.25 - lag_s), turn, mounted.T @ motion[:3, 3]))
+        steps.append(Step(*stamps(start - lag_s, start + 0.25 - lag_s), turn, mounted.T @ motion[:3, 3]))
     found = compare_motion(steps, odometry)
     assert found is not None and found.lag_s == pytest.approx(lag_s) and found.mounting_deg is not None
     np.testing.assert_allclose(np.radians(found.mounting_deg), [0.1, -0.2, 0.3], atol=0.01)
@@ -112,7 +112,7 @@ def test_a_clock_that_is_off_is_found_whatever_the_mounting(lag_s: float) -> Non
 def test_motion_that_has_nothing_to_do_with_the_odometry_says_nothing(rng: np.random.Generator) -> None:
     seconds = np.arange(0, 60, 0.05)
     odometry = Trajectory((seconds * 1e9).astype(np.int64), bumpy(seconds))
-    noise = [(stamps(s, s + 0.25), rng.normal(0, 0.02, 3), rng.normal(0, 0.2, 3)) for s in np.arange(5, 50, 0.25)]
+    noise = [Step(*stamps(s, s + 0.25), rng.normal(0, 0.02, 3), rng.normal(0, 0.2, 3)) for s in np.arange(5, 50, 0.25)]
     assert compare_motion(noise, odometry) is None
 
 
@@ -127,6 +127,6 @@ def test_a_clock_is_right_until_the_motion_clearly_says_otherwise(seed: int) -> 
     for start, earlier, later in zip(starts, bumpy(starts), bumpy(starts + 0.25), strict=True):
         motion = np.linalg.inv(earlier) @ later
         turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec() + rng.normal(0, 0.01, 3)
-        steps.append((stamps(start - 0.08, start + 0.17), turn, motion[:3, 3]))
+        steps.append(Step(*stamps(start - 0.08, start + 0.17), turn, motion[:3, 3]))
     found = compare_motion(steps, odometry)
     assert found is None or found.lag_s == 0

@@ -10,9 +10,9 @@ import pytest
 from command_line import only_line, umf
 
 from umf_ros import __version__
+from umf_ros.commands import doctor as checks
 from umf_ros.core.errors import either
 from umf_ros.core.resources import dataset_names
-from umf_ros.lab.commands import inspect as checks
 
 COMMANDS = "demo simulate replay compare play report evaluate explain train export doctor".split()
 GROUPS = {"pretrain": ["image", "lidar"], "graph": ["optimize", "plot"]}

@@ -9,7 +9,7 @@ import pytest
 from measurements import BAD, BAD_VIEWS, GOOD, GOOD_VIEWS
 
 from umf_ros.core.errors import ConfigError
-from umf_ros.lab.fit.acceptance import MEASUREMENTS, save_acceptance
+from umf_ros.lab.fit.acceptance import save_acceptance
 from umf_ros.verification import RejectReason
 from umf_ros.verification.acceptance import (
     CRITERIA,
@@ -22,6 +22,7 @@ from umf_ros.verification.acceptance import (
 )
 from umf_ros.verification.constants import MAX_MISFIT, MIN_LEAD, MIN_TERRAIN, SUBMAP_UNEXPLAINED
 from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, kind_of
+from umf_ros.verification.measurement import MEASUREMENTS
 
 RIVALS, STANDING = ("rival_near", "rival_far"), ("upright_counterparts", "unexplained")
 NARROW = {"terrain_rival": 0.2, "relief_m": 0.1, "prior_sigmas": 0.8, "support": 2.0}

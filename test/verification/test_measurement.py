@@ -11,11 +11,11 @@ from measurements import GOOD, GOOD_VIEWS
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, ScanMotion
-from umf_ros.lab.fit.acceptance import MEASUREMENTS
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_scan
 from umf_ros.verification import Hypothesis, Verifier
 from umf_ros.verification.constants import BLUR_M
 from umf_ros.verification.hypothesis import IMAGE, SCAN, kind_of
+from umf_ros.verification.measurement import MEASUREMENTS
 
 GROUND = landscape(20)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)

@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 
 from umf_ros.core.config import Verification
-from umf_ros.core.frames import Candidate, Embedding, Keyframe, ScanMotion
+from umf_ros.core.frames import Candidate, Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, make_pose, near, relative, rotation_angle
-from umf_ros.lab.scan_files import UNCALIBRATED
+from umf_ros.detector import NOT_EMBEDDED, assemble
+from umf_ros.lab.scan_files import make_snapshot
 from umf_ros.lab.simulation.domains.pairs import is_wrong
 from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, Domain, survey
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
+from umf_ros.sensors.decode import Cloud
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
 from umf_ros.verification.hypothesis import SCAN
-from umf_ros.verification.prepared_scan import thin_scan
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
 LEAST = 0.7  # probability of a right pose where nothing stands up from the ground
@@ -348,5 +349,5 @@ def test_a_pose_is_compared_with_hypotheses_that_ranked_behind_it(monkeypatch: p
 
 def snapshot(points: Array, at_s: float) -> Keyframe:
     """The keyframe of a scan that nothing else is known of."""
-    blind = Embedding(np.empty(0, np.float32))
-    return Keyframe(round(at_s * 1e9), blind, UNCALIBRATED.camera, np.eye(4), thin_scan(points))
+    cloud = Cloud(points.astype(np.float32), None)
+    return assemble(make_snapshot(cloud, stamp_ns=round(at_s * 1e9)), NOT_EMBEDDED)

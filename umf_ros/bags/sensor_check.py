@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import nan
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Frame, Image
-from umf_ros.core.geometry import Array, cubes, invert
+from umf_ros.core.geometry import Array, first_of_cubes, invert
 from umf_ros.core.trajectory import Trajectory, interpolated
 from umf_ros.embedding.depth import disparities
 
@@ -31,12 +31,22 @@ BETTER = 0.75  # by hand: residual at another lag over that at lag 0, below whic
 CONTRAST = 0.6  # by hand: residual at the best lag over the median one, above which the lag is unknown
 
 MeasuredScan = tuple[small_gicp.PointCloud, small_gicp.KdTree, int]
+"""A thinned scan, its tree, and its mean stamp in ns."""
 
 
-Step = tuple[tuple[int, int], Array, Array]
-"""Motion between two measurements of a sensor: their stamps in ns, (3,) rotation vector in rad and (3,) shift in m, in
-the body axes of the calibration; the shift of a single camera is a unit vector, as it measures no length."""
-_STEPS = np.dtype([("span_ns", np.int64, 2), ("turn", float, 3), ("shift", float, 3)])
+class Step(NamedTuple):
+    """Motion between two consecutive measurements of one sensor.
+
+    Attributes:
+        start_ns, end_ns: their stamps.
+        turn: (3,) rotation vector, rad, about the body axes of the calibration.
+        shift: (3,) m in these axes, or a unit vector for a single camera, which measures no length.
+    """
+
+    start_ns: int
+    end_ns: int
+    turn: Array
+    shift: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +78,7 @@ def as_measured(frame: Frame) -> MeasuredScan | None:
         turns = Rotation.from_rotvec(-moments[:, None] * frame.motion.rates[3:])
         measured = turns.apply(frame.points - moments[:, None] * frame.motion.rates[:3]).astype(np.float32)
         # the points that remain after the alignment thins them
-        thinned = np.unique(cubes(frame.points, SCAN_CELL_M), return_index=True)[1]
+        thinned = first_of_cubes(frame.points, SCAN_CELL_M)
         levers: Array = np.square(frame.points[thinned].astype(float)).sum(axis=1)
         mean_s = float(np.average(moments[thinned], weights=levers + 1e-9))
     cloud, tree = small_gicp.preprocess_points(measured.astype(float), SCAN_CELL_M, num_threads=1)
@@ -80,7 +90,7 @@ def scan_step(before: MeasuredScan, after: MeasuredScan) -> Step | None:
     (target, tree, start_ns), (source, _, end_ns) = before, after
     found = small_gicp.align(target, source, tree, max_correspondence_distance=SCAN_REACH_M, num_threads=1)
     turn = Rotation.from_matrix(found.T_target_source[:3, :3]).as_rotvec()
-    return ((start_ns, end_ns), turn, found.T_target_source[:3, 3]) if found.converged else None
+    return Step(start_ns, end_ns, turn, found.T_target_source[:3, 3]) if found.converged else None
 
 
 def view_step(earlier: Frame, later: Frame) -> Step | None:
@@ -100,7 +110,7 @@ def view_step(earlier: Frame, later: Frame) -> Step | None:
         return None
     mounted = earlier.body_T_camera[:3, :3]
     turned = Rotation.from_matrix(mounted @ turn.T @ mounted.T).as_rotvec()
-    return (earlier.image_stamp_ns, later.image_stamp_ns), turned, mounted @ (-turn.T @ shift).ravel()
+    return Step(earlier.image_stamp_ns, later.image_stamp_ns, turned, mounted @ (-turn.T @ shift).ravel())
 
 
 def _tracked(earlier: Image, later: Image) -> tuple[Any, Any] | None:
@@ -126,18 +136,19 @@ def compare_motion(steps: list[Step], odometry: Trajectory) -> Disagreement | No
     """
     if len(steps) < MIN_PAIRS or len(odometry) < MIN_PAIRS:
         return None
-    seen = np.array(steps, _STEPS)
-    seen_ways = _directions(seen["shift"])
+    spans_ns = np.array([(step.start_ns, step.end_ns) for step in steps], np.int64)
+    seen_turns = np.stack([step.turn for step in steps])
+    seen_ways = _directions(np.stack([step.shift for step in steps]))
     tried: list[tuple[float, float, Array, bool]] = []
     for lag in LAGS_S:
-        moved = seen["span_ns"] + round(lag * 1e9)
+        moved = spans_ns + round(lag * 1e9)
         inside = (moved[:, 0] >= odometry.stamps_ns[0]) & (moved[:, 1] <= odometry.stamps_ns[-1])
         if inside.sum() < MIN_PAIRS:
             continue
         first, last = (interpolated(odometry.stamps_ns, odometry.poses, stamps) for stamps in moved[inside].T)
         stated = invert(first) @ last
         turns, ways = Rotation.from_matrix(stated[:, :3, :3]).as_rotvec(), _directions(stated[:, :3, 3])
-        rotation, residuals, known = _one_rotation(seen["turn"][inside], turns, seen_ways[inside], ways)
+        rotation, residuals, known = _one_rotation(seen_turns[inside], turns, seen_ways[inside], ways)
         tried.append((_spread(residuals), float(lag), rotation, known))
     if not tried:
         return None

@@ -187,6 +187,11 @@ def cubes(points: Array, cell_m: float) -> NDArray[np.int64]:
     return found
 
 
+def first_of_cubes(points: Array, cell_m: float) -> NDArray[np.intp]:
+    """Return the index of the first of points (N, 3) in every occupied cube of this side, m, in order."""
+    return np.sort(np.unique(cubes(points, cell_m), return_index=True)[1])
+
+
 _RADIUS_M, _ECCENTRICITY2 = 6_378_137.0, 6.694379990141e-3
 """Semi-major axis, and first eccentricity squared."""
 

@@ -109,6 +109,7 @@ class InterRobotMatcher:
     Where the scans of a sparse or narrow sensor give no closure, the most probable candidate is compared as a submap.
 
     Args:
+        settings: all settings.
         submaps: of the rover's drive; their store has an outbox.
         identity: name of the embedder and its dimension.
 

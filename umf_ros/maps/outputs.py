@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from umf_ros.core.config import TerrainSettings
 from umf_ros.core.errors import UmfError, reading, writing
-from umf_ros.core.geometry import Array, cubes, evenly, invert, transform
+from umf_ros.core.geometry import Array, evenly, first_of_cubes, invert, transform
 from umf_ros.core.io import atomic_write, write_atomically
 from umf_ros.core.trajectory import Trajectory, write_geojson, write_tum
 from umf_ros.localizer import POSES, read_poses
@@ -166,7 +166,7 @@ def _write_report(folder: Path, summary: dict[str, Any]) -> None:
 
 def thin(cloud: NDArray[np.void], voxel_m: float = VOXEL_M) -> NDArray[np.void]:
     """Keep the first point of `CLOUD` in every voxel."""
-    return cloud[np.unique(cubes(cloud["point"].astype(float), voxel_m), return_index=True)[1]]
+    return cloud[first_of_cubes(cloud["point"].astype(float), voxel_m)]
 
 
 def thickness(cloud: NDArray[np.void]) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Keyframe, ScanMotion
-from umf_ros.core.geometry import Array, cubes, heading, relative, transform
+from umf_ros.core.geometry import Array, cubes, first_of_cubes, heading, relative, transform
 from umf_ros.places.store import KeyframeStore
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan
@@ -61,10 +61,10 @@ def _merged(keyframe: Keyframe, others: Sequence[Keyframe], drift: DriftMeter) -
     owner = np.repeat(np.arange(len(scans)), [len(one.points) for one in scans])
     inside = (owner == 0) | (np.einsum("ij,ij->i", points, points) < const.MAX_RANGE_M**2)
     points, owner = points[inside], owner[inside]
-    cell_m, chosen = const.THIN_CELL_M, _first_of_cubes(points, const.THIN_CELL_M)
+    cell_m, chosen = const.THIN_CELL_M, first_of_cubes(points, const.THIN_CELL_M)
     while len(chosen) > const.MERGED_POINTS and len(chosen) > len(keyframe.points):
         cell_m *= max(float(np.sqrt(len(chosen) / const.MERGED_POINTS)), 1.05)
-        chosen = _first_of_cubes(points, cell_m)
+        chosen = first_of_cubes(points, cell_m)
         chosen = np.concatenate([np.arange(len(keyframe.points)), chosen[owner[chosen] > 0]])
     taken = sorted(set(owner[chosen].tolist()), key=lambda number: scans[number].stamp_ns)
     seconds = np.array([1e-9 * (one.stamp_ns - keyframe.stamp_ns) for one in scans], np.float32)
@@ -77,11 +77,6 @@ def _merged(keyframe: Keyframe, others: Sequence[Keyframe], drift: DriftMeter) -
         body_T_lidars=np.stack([_body_T_other(keyframe, scans[i]) @ scans[i].body_T_lidar for i in taken]),
     )
     return replace(keyframe, points=points[chosen].astype(np.float32), motion=motion)
-
-
-def _first_of_cubes(points: Array, cell_m: float) -> NDArray[np.intp]:
-    """Indices of the first of (N, 3) points in every occupied cube of this side, in order."""
-    return np.sort(np.unique(cubes(points, cell_m), return_index=True)[1])
 
 
 def _body_T_other(keyframe: Keyframe, other: Keyframe) -> Array:
@@ -132,7 +127,7 @@ class DriftMeter:
         """Compare a scan with those before it, newest first."""
         points = np.concatenate([moved_to(before[0], one) for one in before[::-1]])
         ways_m = np.concatenate([np.full(len(one.points), _way_m(keyframe, one)) for one in before[::-1]])
-        oldest = _first_of_cubes(points, const.TERRAIN_CELL_M)
+        oldest = first_of_cubes(points, const.TERRAIN_CELL_M)
         match = PreparedScan(points[oldest].astype(np.float32))
         query = PreparedScan.of(keyframe)
         if not (match.usable and query.usable):

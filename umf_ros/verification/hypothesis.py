@@ -52,8 +52,8 @@ class Hypothesis:
     Attributes:
         query_stamp_ns: key of the query keyframe.
         candidate: the candidate.
-        measurements: results of the tests by name (`MEASUREMENTS` of `umf_ros/lab/fit/acceptance.py`); of the candidate
-            alone without a pose.
+        measurements: results of the tests by name (`MEASUREMENTS` in `measurement`); of the candidate alone without
+            a pose.
         reason: why it is no closure; None before the decision and when accepted.
         detail: figures for `reason`.
         probability: that the pose is right; None without a pose.

@@ -1,8 +1,7 @@
 """Measurements of an aligned hypothesis: the numbers that the decision is made from.
 
-A new test is three steps: a number in one of the functions below with its meaning in `MEASUREMENTS` of
-`umf_ros/lab/fit/acceptance.py`, a `Criterion` in `acceptance` with the values that speak for a closure, and a fit
-(`umf_ros/lab/fit/`), which gives it its weight.
+A new test is three steps: a number in one of the functions below with its meaning in `MEASUREMENTS`, a `Criterion` in
+`acceptance` with the values that speak for a closure, and a fit (`umf_ros/lab/fit/`), which gives it its weight.
 """
 
 from __future__ import annotations
@@ -26,6 +25,42 @@ from umf_ros.verification.scan_alignment import (
 )
 from umf_ros.verification.scan_consistency import compare_scans
 from umf_ros.verification.view_alignment import ViewAlignment
+
+MEASUREMENTS = {
+    "similarity": "cosine similarity of the global descriptors",
+    "inliers_image": "pairs of image features that one homography explains",
+    "inliers_cloud": "pairs of the scan's features that one rigid motion explains",
+    "superfeatures": "eligible pairs of super-features, where the reranking goes by them",
+    "residual_m": "median point-to-plane distance of the scans; of views, median distance of paired points",
+    "residual_p90_m": "nine of ten points are nearer than this to their counterpart's plane",
+    "noise_m": "how far the match's points scatter about their own planes",
+    "overlap": "share of the points seen by both that have a counterpart; of views, share of the pairs that agree",
+    "points": "points that have a counterpart",
+    "merged": "scans behind the larger of two submaps; 1 where two single scans were aligned",
+    "terrain_correlation": "correlation of the relief of both scans, -1 to 1",
+    "terrain_score": "the same in standard deviations of chance",
+    "terrain_rival": "the correlation at the best of some poses beside this one, of submaps of narrow sensors",
+    "relief_m": "standard deviation of the relief on the ground that both scans saw",
+    "common": "share of a scan's points that the other should see, the smaller of both ways, as all that follow",
+    "contradiction": "share of these that the other's rays passed by, the larger of both",
+    "counterparts": "share of these that have a counterpart",
+    "upright_counterparts": "of walls, trunks and rocks that should be seen, the share with a counterpart",
+    "unexplained": "of the same, the share that is far from everything, the larger of both",
+    "rival_near": "logarithm of how much worse the points fit half a metre on; unknown for improbable hypotheses",
+    "rival_far": "the same of the best fit 1 to 6 m on; 0 when another pose fits as well",
+    "lead": "how much worse points, or in a passage surfaces, fit elsewhere; a closure needs 1",
+    "runner_up": "logarithm of how much more is missing at the next best hypothesis about the pair",
+    "pose_inliers": "feature pairs that agree with the pose",
+    "residual_sigmas": "errors of reprojection in standard deviations of the features' noise",
+    "spread": "of the pairs across the image: smaller deviation of column and row, as a share of width and height",
+    "disparity_bias_px": "estimated bias of all disparities; positive where stereo measures too little",
+    "two_way_m": "distance of the poses that the query's depths and the match's give by themselves",
+    "position_std_m": "standard deviation of the position along its least known direction, from the residuals",
+    "heading_std_deg": "of the heading",
+    "prior_sigmas": "distance from what odometry predicts, in standard deviations of its drift",
+    "support": "earlier keyframes, of the last few, that found a pose which odometry carries over to this one",
+}
+"""Name and meaning of every measurement, as in `candidates.csv` and on `~/candidates`."""
 
 
 def measure(hypothesis: Hypothesis) -> dict[str, float]:

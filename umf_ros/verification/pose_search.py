@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -103,17 +104,14 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     """
     level = levelled(match, query, pose)
     theirs, ours = match.map(query.cell_m), query.map(query.cell_m)
-    row, column = np.round(level[:2, 3] / query.cell_m).astype(int) + const.MAP_SHIFT
     turns = float(heading(level)) + np.array([0.0, np.pi])
+    correlation = _correlate(theirs, ours.turned_spectra(turns))
+    row, column = np.round(level[:2, 3] / query.cell_m).astype(int) + const.MAP_SHIFT
+    correlation[:, 0, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
     found = []
-    for turn, overlap in zip(turns, match.view.overlap(query.view, turns), strict=True):
-        if overlap < const.SEARCHED_OVERLAP:
-            continue
-        volumes = _correlate(theirs, ours.turned_spectra(np.array([turn])))
-        if turn == turns[0]:
-            volumes[:, :, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
-        peaks = _peaks(volumes, np.zeros(1, np.intp), const.PEAKS // 2, query.cell_m)
-        found += [_by_scouts(match, query, lifted(match, query, turn, shift)) for _, shift in peaks]
+    for number in np.flatnonzero(match.view.overlap(query.view, turns) >= const.SEARCHED_OVERLAP):
+        peaks = _peaks(correlation[:, [number]], np.zeros(1, np.intp), const.PEAKS // 2, query.cell_m)
+        found += [_by_scouts(match, query, lifted(match, query, turns[number], shift)) for _, shift in peaks]
     return found
 
 
@@ -218,8 +216,11 @@ def paired_views(query: Keyframe, match: Keyframe, settings: Verification) -> Pa
     return PairedViews.of(query, match, const.VIEW_NOISE[settings.features])
 
 
-_Finding = tuple[Keyframe, Keyframe, Array, bool]
-"""A query, its match, `match_T_query` and whether it was accepted."""
+class _Finding(NamedTuple):
+    query: Keyframe
+    match: Keyframe
+    match_T_query: Array
+    accepted: bool
 
 
 class TemporalMemory:
@@ -234,7 +235,7 @@ class TemporalMemory:
 
     def remember(self, query: Keyframe, found: list[tuple[Keyframe, Array, bool]]) -> None:
         """Add what one keyframe found: matched keyframes, `match_T_query` and whether it was accepted."""
-        self._findings.append([(query, *finding) for finding in found])
+        self._findings.append([_Finding(query, *finding) for finding in found])
 
     def expected(
         self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]
@@ -246,13 +247,13 @@ class TemporalMemory:
 
     def _expected_distance(self, query: Keyframe, match: Keyframe) -> float:
         """Metres between a pair, as odometry carries it over from the latest accepted closure near it; or inf."""
-        accepted = (one for findings in reversed(self._findings) for one in findings if one[3])
+        accepted = (one for findings in reversed(self._findings) for one in findings if one.accepted)
         carried = (_carried(finding, query, match) for finding in accepted)
         return next((float(np.linalg.norm(pose[:3, 3])) for pose in carried if pose is not None), float("inf"))
 
     def support(self, query: Keyframe, match: Keyframe, match_T_query: Array) -> float:
         """How many of the remembered earlier keyframes found a pose that odometry carries over to this one."""
-        earlier = [[one for one in findings if one[0].stamp_ns != query.stamp_ns] for findings in self._findings]
+        earlier = [[one for one in findings if one.query.stamp_ns != query.stamp_ns] for findings in self._findings]
         carried = [[_carried(finding, query, match) for finding in findings] for findings in earlier]
         return float(
             sum(any(same_pose(pose, match_T_query) for pose in poses if pose is not None) for poses in carried)
@@ -274,10 +275,10 @@ def prior_sigmas(query: Keyframe, match: Keyframe, match_T_query: Array, drift: 
 def _carried(found: _Finding, query: Keyframe, match: Keyframe) -> Array | None:
     """`match_T_query` as odometry carries it over from an earlier finding; None where that is far or unknown."""
     steps = []
-    for before, now in ((found[0], query), (found[1], match)):
+    for before, now in ((found.query, query), (found.match, match)):
         if before.odom_T_body is None or now.odom_T_body is None or before.session != now.session:
             return None
         steps.append(relative(before.odom_T_body, now.odom_T_body))
     if sum(float(np.linalg.norm(step[:3, 3])) for step in steps) > const.ODOMETRY_REACH_M:
         return None
-    return relative(steps[1], found[2] @ steps[0])
+    return relative(steps[1], found.match_T_query @ steps[0])

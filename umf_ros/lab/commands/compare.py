@@ -177,8 +177,7 @@ def explain(
     from rich.console import Console
 
     from umf_ros.bags.frames import FrameReader
-    from umf_ros.detector import assemble, make_detector_embedder
-    from umf_ros.embedding.depth import lift
+    from umf_ros.detector import make_detector_embedder, make_keyframe
     from umf_ros.lab.evaluation.comparison import draw
     from umf_ros.lab.evaluation.comparison import explain as explained
     from umf_ros.lab.evaluation.place_views import nearest_frames
@@ -194,7 +193,7 @@ def explain(
         if isinstance(one, BagError):
             raise one
         frames.append(one)
-    query_keyframe, match_keyframe = (assemble(frame, lift(frame, network.embed(frame))) for frame in frames)
+    query_keyframe, match_keyframe = (make_keyframe(frame, network) for frame in frames)
     explanation = explained(query_keyframe, match_keyframe, settings.verification)
     draw(explanation, frames[0].left, frames[1].left, out)
     console.print(explanation.verdict, highlight=False)

@@ -15,7 +15,7 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import KeyframePolicy
 from umf_ros.core.errors import BagError, UmfError
 from umf_ros.core.frames import Frame, Keyframe
-from umf_ros.detector import NOT_EMBEDDED, KeyframeSelector, assemble
+from umf_ros.detector import NOT_EMBEDDED, KeyframeSelector, assemble, make_keyframe
 from umf_ros.embedding import Embedder
 from umf_ros.embedding.depth import lift
 from umf_ros.lab.scan_files import (
@@ -159,7 +159,7 @@ class ViewReader:
             names = ["", ""]
         left, right = (fit_image(read_image(Path(name)), self._calibration) if name else None for name in names)
         frame = make_snapshot(cloud, left, right, self._calibration, warn=self._warn)
-        keyframe = assemble(frame, lift(frame, self._embedder.embed(frame)))
+        keyframe = make_keyframe(frame, self._embedder)
         if not view.left and not len(keyframe.points):
             raise SensorFileError(f"{view.scan} has {OUT_OF_REACH}")
         return keyframe

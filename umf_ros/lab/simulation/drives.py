@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.frames import Frame, Image, Keyframe, ScanMotion, StereoCamera
 from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle, transform
 from umf_ros.core.io import atomic_write
-from umf_ros.detector import assemble
+from umf_ros.detector import make_keyframe
 from umf_ros.embedding import Embedder
-from umf_ros.embedding.depth import lift
 from umf_ros.lab.simulation.camera import TRAINING_SIZE, resized
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.route import SETTINGS, plan_passes
@@ -111,10 +110,7 @@ def simulate(seed: int, family: str, aliasing: float, step_m: float = STEP_M) ->
 def embedded(drive: SurveyedDrive, embedder: Embedder) -> list[Keyframe]:
     """A keyframe for every frame of a drive."""
     frames = track(drive.frames, f"embedding {drive.name}", transient=True)
-    return [
-        assemble(frame, lift(frame, embedder.embed(frame)), metres)
-        for frame, metres in zip(frames, drive.path_length, strict=True)
-    ]
+    return [make_keyframe(frame, embedder, metres) for frame, metres in zip(frames, drive.path_length, strict=True)]
 
 
 def path_length(poses: Array) -> Array:

@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.frames import Candidate, Embedding, Keyframe, LoopClosure, ScanMotion
+from umf_ros.core.frames import Candidate, Keyframe, LoopClosure, ScanMotion
 from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.core.io import atomic_write
-from umf_ros.detector import assemble
+from umf_ros.detector import NOT_EMBEDDED, make_keyframe
 from umf_ros.embedding import Embedder
-from umf_ros.embedding.depth import lift
 from umf_ros.lab.scan_files import UNCALIBRATED, make_snapshot
 from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
 from umf_ros.lab.simulation.domains.passages import Passage
@@ -124,7 +123,7 @@ def keyframe_of(
     frame = make_snapshot(cloud, stamp_ns=stamp_ns)
     if steady and frame.points is not None:
         frame = replace(frame, motion=ScanMotion.none(len(frame.points)))
-    return assemble(frame, lift(frame, embedder.embed(frame)))
+    return make_keyframe(frame, embedder)
 
 
 def places_of(
@@ -150,10 +149,10 @@ def places_of(
 def _keyframe_along(scan: DomainScan, domain: Domain) -> Keyframe:
     """The keyframe of a scan with its odometry, which nothing is known of but its points."""
     stamp_ns = round(scan.path_length_m / MOUNTS[domain.mount].speed_m_s * 1e9)
-    blind, points = Embedding(np.empty(0, np.float32)), thin_scan(scan.sweep.points)
+    points = thin_scan(scan.sweep.points)
     return Keyframe(
         stamp_ns,
-        blind,
+        NOT_EMBEDDED,
         UNCALIBRATED.camera,
         np.eye(4),
         points,

@@ -10,8 +10,9 @@ import numpy
 import pytest
 
 from umf_ros import embedding
+from umf_ros.commands import doctor as checks
+from umf_ros.commands.doctor import command
 from umf_ros.core.errors import WeightsError
-from umf_ros.lab.commands import inspect as checks
 
 
 def broken_package(folder: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> str:
@@ -93,10 +94,10 @@ def test_the_command_fails_exactly_when_something_is_wrong(
     finding = checks.Finding("weights", fine, "what was found", "what helps")
     monkeypatch.setattr(checks, "checks", lambda: [("weights", lambda: finding)])
     if fine:
-        checks.doctor()
+        command()
     else:
         with pytest.raises(typer.Exit) as stopped:
-            checks.doctor()
+            command()
         assert stopped.value.exit_code == status
     output = capsys.readouterr().out
     assert "what was found" in output
