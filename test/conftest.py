@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from hypothesis import settings
+from processes import Process
 
 from umf_ros.core.frames import Embedding, Frame, Keyframe, LocalFeatures, StereoCamera, SuperFeatures
 from umf_ros.core.geometry import make_pose
@@ -97,6 +98,16 @@ def make_frame(stamp_s: float, odom_T_body: np.ndarray | None = None, session: i
         odom_T_body=odom_T_body,
         session=session,
     )
+
+
+@pytest.fixture(autouse=True)
+def no_node_is_left() -> Iterator[None]:
+    """End the nodes of a test that failed: the tests after it share their domain with them."""
+    before = len(Process.started)
+    yield
+    for process in Process.started[before:]:
+        process.kill()
+    del Process.started[before:]
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 ENVIRONMENT = {
     **os.environ,
@@ -26,6 +26,8 @@ ENVIRONMENT = {
 class Process:
     """A node that runs while a test does."""
 
+    started: ClassVar[list[Process]] = []
+
     def __init__(self, module: str, log: Path, *parameters: str, command: list[str] | None = None) -> None:
         flags = [("-r" if parameter.startswith("__") else "-p", parameter) for parameter in parameters]
         arguments = ["--ros-args", *(word for flag in flags for word in flag)]
@@ -37,6 +39,7 @@ class Process:
             stderr=subprocess.STDOUT,
             env=ENVIRONMENT,
         )
+        Process.started.append(self)
 
     @property
     def output(self) -> str:

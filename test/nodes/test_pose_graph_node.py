@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -265,7 +266,7 @@ def test_the_end_of_the_solver_ends_the_node_and_loses_nothing(rig: Rig, tmp_pat
     rig.until(lambda: rig.odometry.get_subscription_count())
     rig.drive(0, 50)
     rig.until(lambda: rig.taken >= 45)
-    taken = rig.taken
+    taken = rig.taken  # diagnostics are of a moment ago: the journal may hold more
     os.kill(process.child, signal.SIGKILL)
     assert wait_until(lambda: process.exit_code is not None)
     journal = tmp_path / "results" / "pose_graph.sqlite"
@@ -274,9 +275,8 @@ def test_the_end_of_the_solver_ends_the_node_and_loses_nothing(rig: Rig, tmp_pat
     assert process.output.splitlines()[-1] == line and "Traceback" not in process.output
     again = Process(MODULE, tmp_path / "two.log", *parameters)
     again.wait_for("ready")
-    assert f"recovered: {taken} odometry messages" in again.output
-    for one in (process, again):
-        one.kill()
+    recovered = re.search(r"recovered: (\d+) odometry messages", again.output)
+    assert recovered and taken <= int(recovered[1]) <= 50
 
 
 def test_a_namespace_is_a_robot(rig: Rig, process: Process, tmp_path: Path) -> None:
