@@ -10,7 +10,15 @@ import torch
 from tiny_worlds import some_scan
 
 from umf_ros.baselines.netvlad import NetVlad
-from umf_ros.baselines.place_network import EARLY, VOXELS, PlaceInput, PreparedView, some_points, stack
+from umf_ros.baselines.place_network import (
+    EARLY,
+    VOXELS,
+    PlaceInput,
+    PreparedView,
+    count_parameters,
+    some_points,
+    stack,
+)
 from umf_ros.baselines.place_networks import (
     NETWORKS,
     load_place_network,
@@ -21,7 +29,6 @@ from umf_ros.baselines.pointnet2 import ball_query, farthest_points
 from umf_ros.core.errors import ConfigError, WeightsError
 from umf_ros.embedding.inputs import voxelise
 from umf_ros.lab.training.networks import save_tensors
-from umf_ros.networks.umf import count_parameters
 
 
 def some_batch(count: int = 3) -> PlaceInput:

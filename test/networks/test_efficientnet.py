@@ -11,9 +11,9 @@ from published import published_tensors
 from torch import Tensor
 
 from umf_ros.baselines.lite0 import EPSILON, pretrained_trunk, trunk_tensors
+from umf_ros.baselines.place_network import count_parameters
 from umf_ros.core.errors import WeightsError
 from umf_ros.networks.efficientnet import CONTRAST, STAGES, EfficientNetLite0, SamePadding
-from umf_ros.networks.umf import count_parameters
 
 CLASSIFIER = 320 * 1280 + 2 * 1280 + 1280 * 1000 + 1000
 COLOURS = 2 * 32 * 9

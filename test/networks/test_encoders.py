@@ -8,8 +8,8 @@ import pytest
 import torch
 from tiny_worlds import TINY, some_input
 
+from umf_ros.baselines.place_network import count_parameters
 from umf_ros.networks.encoders import Backbone, FeaturePyramid, ImageEncoder, ResidualBlock, VoxelEncoder
-from umf_ros.networks.umf import count_parameters
 
 NAMES = ("resnet18", "resnet34", "resnet50")
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from umf_ros.baselines import unit_descriptor
-from umf_ros.baselines.place_network import IMAGE_SIZE, LATE, Gem, ImageTrunk
+from umf_ros.baselines.place_network import IMAGE_SIZE, LATE, Gem, ImageTrunk, count_parameters
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, WeightsError, one_line
 from umf_ros.core.frames import Embedding, Frame, Image, Points
@@ -18,7 +18,6 @@ from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.inputs import is_blank, shrink, standardise
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.efficientnet import STAGES, EfficientNetLite0
-from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import load_weights
 
 TRUNK_FROM = Path("umf_scene")

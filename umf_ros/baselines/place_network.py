@@ -208,3 +208,8 @@ def measured(scan: VoxelScan) -> Tensor:
     parent, child = parent_and_child(torch.from_numpy(scan.fine_index))
     grid = torch.from_numpy(scan.grid).flatten(0, 2).unflatten(1, (MEASURED, 8))
     return grid[parent, :, child]
+
+
+def count_parameters(network: nn.Module) -> int:
+    """Return the number of trainable parameters."""
+    return sum(parameter.numel() for parameter in network.parameters())

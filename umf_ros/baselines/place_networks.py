@@ -11,14 +11,13 @@ from umf_ros.baselines import unit_descriptor
 from umf_ros.baselines.adafusion import AdaFusion
 from umf_ros.baselines.minkloc import MinkLocFusion, MinkLocLidar, MinkLocVisual
 from umf_ros.baselines.netvlad import NetVlad
-from umf_ros.baselines.place_network import PlaceNetwork, stack, stack_images, view_frame
+from umf_ros.baselines.place_network import PlaceNetwork, count_parameters, stack, stack_images, view_frame
 from umf_ros.baselines.pointnet2 import PointNet2
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, UmfError, WeightsError, either
 from umf_ros.core.frames import Embedding, Frame
 from umf_ros.core.resources import find
 from umf_ros.embedding import FeatureRequest
-from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import fill, read_weights
 
 NETWORKS: dict[str, type[PlaceNetwork]] = {

@@ -219,21 +219,6 @@ class Fusion(nn.Module):
         self.image_head, self.cloud_head = nn.Linear(config.tokens, half), nn.Linear(config.tokens, half)
         self.weigh = nn.Linear(2 * config.tokens, 2)
 
-    def forward(
-        self, image: Tokens, cloud: Tokens, image_present: Tensor, cloud_present: Tensor, scene: Tensor | None = None
-    ) -> Fused:
-        """Fuse tokens; rows of an absent modality hold the learned token only.
-
-        Args:
-            image: image tokens.
-            cloud: cloud tokens.
-            image_present: (B,) bool.
-            cloud_present: (B,) bool.
-            scene: (B, S) scene descriptors or None; their length is their weight beside the image half.
-        """
-        pooled = self.pool(image, cloud)
-        return self.describe(*pooled, image_present, cloud_present, scene)
-
     def pool(self, image: Tokens, cloud: Tokens) -> tuple[Tensor, Tensor]:
         """Return the pooled tokens (B, C) of the image and of the cloud, the input of the heads."""
         for layer in self.layers:
@@ -245,7 +230,15 @@ class Fusion(nn.Module):
     def describe(
         self, image: Tensor, cloud: Tensor, image_present: Tensor, cloud_present: Tensor, scene: Tensor | None = None
     ) -> Fused:
-        """Return the descriptors of pooled tokens; the other arguments as in `forward`."""
+        """Return the descriptors of pooled tokens.
+
+        Args:
+            image: (B, C) pooled image tokens.
+            cloud: (B, C) pooled cloud tokens.
+            image_present: (B,) bool.
+            cloud_present: (B,) bool.
+            scene: (B, S) scene descriptors or None; their length is their weight beside the image half.
+        """
         with torch.autocast(image.device.type, enabled=False):
             image_half = nn.functional.normalize(self.image_head(image.float()), dim=-1)
             if scene is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -21,8 +20,6 @@ from umf_ros.networks.fusion import (
     sine_encoding,
 )
 from umf_ros.networks.local_features import CloudLocal, ImageLocal, IterativeAttention, LocalMap, SuperMap
-
-Branch = Literal["both", "image", "cloud"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,37 +80,34 @@ class UMF(nn.Module):
         self.coarse_voxels = VoxelPositions(CELLS // 4, config.tokens)
         self.voxels = VoxelPositions(CELLS, config.local)
 
-    def encode(self, batch: NetworkInput, branch: Branch = "both") -> Features:
-        """Run the encoders and add the positions to the tokens; the features of an omitted branch are zero."""
-        scene = None
-        if branch == "cloud":
-            size = batch.image.shape[0]
-            scene = None if self.scene is None else batch.image.new_zeros(size, self.config.scene)
-            image = batch.image.new_zeros(size, *self.cells.shape)
-            fine_image = batch.image.new_zeros(size, self.config.local, *self.image_local.positions.shape[:2])
-        else:
-            coarse, fine_image = self.image_encoder(batch.image)
-            image = self.image_tokens(coarse.flatten(2).transpose(1, 2))
-            image = image + self.cells.to(image.dtype)
-            scene = None if self.scene is None else self.scene(batch.image)
-        everywhere = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device)
-        if branch == "image":
-            cloud = batch.image.new_zeros(*batch.coarse_index.shape, self.config.tokens)
-            fine_cloud = batch.image.new_zeros(*batch.fine_index.shape, self.config.local)
-        else:
-            cloud, fine_cloud = self.voxel_encoder(batch.grid, batch.coarse_index, batch.fine_index)
-            cloud = self.cloud_tokens(cloud)
-            cloud = cloud + self.coarse_voxels(batch.coarse_index).to(cloud.dtype)
-        return Features(Tokens(image, everywhere), Tokens(cloud, batch.coarse_mask), fine_image, fine_cloud, scene)
+    def encode(self, batch: NetworkInput) -> Features:
+        """Run the encoders and add the positions to the tokens."""
+        image, fine_image = self.encode_image(batch)
+        cloud, fine_cloud = self.encode_cloud(batch)
+        return Features(image, cloud, fine_image, fine_cloud, None if self.scene is None else self.scene(batch.image))
+
+    def encode_image(self, batch: NetworkInput) -> tuple[Tokens, Tensor]:
+        """Return the tokens and the fine features of the images."""
+        coarse, fine = self.image_encoder(batch.image)
+        tokens = self.image_tokens(coarse.flatten(2).transpose(1, 2))
+        tokens = tokens + self.cells.to(tokens.dtype)
+        return Tokens(tokens, torch.ones(tokens.shape[:2], dtype=torch.bool, device=tokens.device)), fine
+
+    def encode_cloud(self, batch: NetworkInput) -> tuple[Tokens, Tensor]:
+        """Return the tokens and the fine features of the scans."""
+        coarse, fine = self.voxel_encoder(batch.grid, batch.coarse_index, batch.fine_index)
+        tokens = self.cloud_tokens(coarse)
+        return Tokens(tokens + self.coarse_voxels(batch.coarse_index).to(tokens.dtype), batch.coarse_mask), fine
 
     def fuse(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> Fused:
         """Return descriptors, with the modalities that are present (B,) bool."""
-        image, cloud = self.stand_in(features, image_present, cloud_present)
-        return self.fusion(image, cloud, image_present, cloud_present, features.scene)
+        pooled = self.pool(features, image_present, cloud_present)
+        return self.fusion.describe(*pooled, image_present, cloud_present, features.scene)
 
-    def stand_in(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> tuple[Tokens, Tokens]:
-        """Return the tokens of both modalities, with learned tokens for absent ones ((B,) bool)."""
-        return self.absent_image(features.image, image_present), self.absent_cloud(features.cloud, cloud_present)
+    def pool(self, features: Features, image_present: Tensor, cloud_present: Tensor) -> tuple[Tensor, Tensor]:
+        """Return pooled tokens (B, C) of both modalities, with learned tokens for absent ones ((B,) bool)."""
+        image = self.absent_image(features.image, image_present)
+        return self.fusion.pool(image, self.absent_cloud(features.cloud, cloud_present))
 
     def describe_local(self, features: Features, batch: NetworkInput) -> tuple[LocalMap, LocalMap]:
         """Return local features of the images and of the scans."""
@@ -160,11 +154,6 @@ class FlatUmf(nn.Module):
             if supers is not None:
                 named |= {name: supers.descriptors, f"{name}_strength": supers.strength}
         return tuple(named[name] for name in self.outputs)
-
-
-def count_parameters(network: nn.Module) -> int:
-    """Return the number of trainable parameters."""
-    return sum(parameter.numel() for parameter in network.parameters())
 
 
 def channels_last(network: nn.Module) -> None:

@@ -14,6 +14,7 @@ import torch
 from landmarks import LandmarkEmbedder, frame_of
 from tiny_worlds import TINY
 
+from umf_ros.baselines.place_network import count_parameters
 from umf_ros.core.frames import Embedding, Frame
 from umf_ros.lab.evaluation import summary as summary_module
 from umf_ros.lab.evaluation.results import Scores, YawBin, precision_recall
@@ -29,7 +30,7 @@ from umf_ros.lab.evaluation.summary import (
 )
 from umf_ros.lab.evaluation.worlds import ASKED
 from umf_ros.lab.training.networks import save_weights
-from umf_ros.networks.umf import UMF, count_parameters
+from umf_ros.networks.umf import UMF
 
 CURVE = precision_recall(np.array([0.9, 0.5]), np.array([True, False]), np.ones(2, bool))
 NAMES = (*ASKED, "same light", *METHODS)

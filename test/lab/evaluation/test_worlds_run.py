@@ -10,12 +10,13 @@ import torch
 from landmarks import CONFUSED, PLACES, LandmarkEmbedder, LineWorld
 from tiny_worlds import TINY
 
+from umf_ros.baselines.place_network import count_parameters
 from umf_ros.core.config import Verification
 from umf_ros.lab.evaluation import worlds as worlds_run
 from umf_ros.lab.evaluation.summary import WorldResult, cost_of_weights
 from umf_ros.lab.evaluation.worlds import PICTURES, WorldEvaluation, WorldsRun
 from umf_ros.lab.training.networks import save_weights
-from umf_ros.networks.umf import UMF, count_parameters
+from umf_ros.networks.umf import UMF
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,11 @@ import torch
 from safetensors.torch import load_file
 from tiny_worlds import TINY, some_input
 
+from umf_ros.baselines.place_network import count_parameters
 from umf_ros.core.errors import OutputError, WeightsError
 from umf_ros.lab.training.networks import PRESETS, branch_layers, fine_layers, read_card, save_weights
 from umf_ros.networks.config import NetworkConfig
-from umf_ros.networks.umf import UMF, count_parameters
+from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from umf_ros.baselines.place_network import count_parameters
 from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.core.frames import Frame, Keyframe, LocalFeatures, SuperFeatures
@@ -36,7 +37,6 @@ from umf_ros.lab.evaluation.retrieval import (
 )
 from umf_ros.lab.evaluation.summary import ETNA_RECALL1, measure
 from umf_ros.networks.config import locate_weights
-from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import load_weights
 from umf_ros.places.database import PlaceIndex
 

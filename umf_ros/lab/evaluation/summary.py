@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from umf_ros.baselines.place_network import count_parameters
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array
@@ -19,7 +20,6 @@ from umf_ros.embedding.umf import UmfEmbedder
 from umf_ros.lab.evaluation.results import Figures, Scores, TextTable, YawBin, mean, percent, rounded, scores_table
 from umf_ros.lab.evaluation.retrieval import METHODS, RERANKERS, TOP_K, Indices
 from umf_ros.networks.config import locate_weights
-from umf_ros.networks.umf import count_parameters
 from umf_ros.networks.weights import load_weights
 from umf_ros.sensors.calibration import load_calibration
 

@@ -204,8 +204,7 @@ def pool(network: UMF, frame: Frame) -> tuple[NDArray, ...]:
     with torch.inference_mode():
         features = network.encode(batch)
         cloud_present = batch.coarse_mask.any(1)
-        tokens = network.stand_in(features, batch.image_present, cloud_present)
-        seen, felt = network.fusion.pool(*tokens)
+        seen, felt = network.pool(features, batch.image_present, cloud_present)
         cells = network.scene.pool(batch.image).flatten(1).half()
     return tuple(each[0].numpy() for each in (seen, felt, cells, batch.image_present, cloud_present))
 

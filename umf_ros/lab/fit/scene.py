@@ -17,6 +17,7 @@ import typer
 from torch import Tensor
 
 from umf_ros.baselines.lite0 import pretrained_trunk
+from umf_ros.baselines.place_network import count_parameters
 from umf_ros.core.frames import Image
 from umf_ros.core.io import atomic_write
 from umf_ros.lab.datasets.sample import Places, Rule, Sample, SampleSequence, places_of
@@ -29,7 +30,7 @@ from umf_ros.lab.training.networks import read_card, save_weights
 from umf_ros.lab.training.prepared_views import CameraLook, draw_look
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.efficientnet import DEPTH, STAGES, EfficientNetLite0
-from umf_ros.networks.umf import UMF, channels_last, count_parameters
+from umf_ros.networks.umf import UMF, channels_last
 from umf_ros.networks.weights import load_weights
 
 RULE = Rule(negative_m=14.0, negative_deg=35.0, between_passes=True)

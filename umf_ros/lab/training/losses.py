@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from umf_ros.lab.datasets.sample import Places, Rule, distances, label
 from umf_ros.lab.evaluation.retrieval import NEAR_M
 from umf_ros.lab.training.batches import TrainingBatch
-from umf_ros.lab.training.networks import MetricSettings
-from umf_ros.networks.config import NetworkConfig
+from umf_ros.lab.training.networks import Branch, MetricSettings
+from umf_ros.networks.config import NetworkConfig, NetworkInput
+from umf_ros.networks.fusion import Tokens
 from umf_ros.networks.local_features import LocalMap, SuperMap
 from umf_ros.networks.umf import UMF, Features
 
@@ -269,6 +270,24 @@ def attenuate(values: Tensor, share: float) -> Tensor:
     return values * share + values.detach() * (1 - share)
 
 
+def _encode_branch(network: UMF, batch: NetworkInput, branch: Branch) -> Features:
+    """Run the encoder of one branch; the features of the other one are zero."""
+    tokens, fine = network.encode_image(batch) if branch == "image" else network.encode_cloud(batch)
+    scene = network.scene(batch.image) if branch == "image" and network.scene is not None else None
+    rows, width = len(batch.image), network.config.tokens
+    if branch == "image":
+        cloud = Tokens(batch.image.new_zeros(*batch.coarse_index.shape, width), batch.coarse_mask)
+        return Features(
+            tokens, cloud, fine, batch.image.new_zeros(*batch.fine_index.shape, network.config.local), scene
+        )
+    if network.scene is not None:
+        scene = batch.image.new_zeros(rows, network.config.scene)
+    cells = batch.image.new_zeros(rows, *network.cells.shape)
+    everywhere = torch.ones(cells.shape[:2], dtype=torch.bool, device=cells.device)
+    fine_image = batch.image.new_zeros(rows, network.config.local, *network.image_local.positions.shape[:2])
+    return Features(Tokens(cells, everywhere), tokens, fine_image, fine, scene)
+
+
 class MetricLoss(nn.Module):
     """Losses of a network on one batch."""
 
@@ -290,7 +309,7 @@ class MetricLoss(nn.Module):
         """
         branch = self._settings.branch
         image_kept, cloud_kept = batch.image_kept, batch.cloud_kept
-        features = network.encode(batch.input, branch)
+        features = network.encode(batch.input) if branch == "both" else _encode_branch(network, batch.input, branch)
         if branch != "both":
             nothing = torch.zeros_like(image_kept)
             image_kept = batch.input.image_present if branch == "image" else nothing

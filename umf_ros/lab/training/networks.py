@@ -18,10 +18,11 @@ from umf_ros.core.config import Group
 from umf_ros.core.errors import ConfigError, OutputError, WeightsError
 from umf_ros.networks.config import NetworkConfig
 from umf_ros.networks.encoders import ResidualBlock, ResidualBlock3d
-from umf_ros.networks.umf import UMF, Branch, channels_last
+from umf_ros.networks.umf import UMF, channels_last
 from umf_ros.networks.weights import SCALE, load_weights
 
 Precision = Literal["half", "int8"]
+Branch = Literal["both", "image", "cloud"]
 
 
 class RunSettings(Group):

@@ -21,6 +21,7 @@ import torch.distributed as dist
 from pydantic import ValidationError
 from torch import nn
 
+from umf_ros.baselines.place_network import count_parameters
 from umf_ros.core.config import problems
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.io import read_values
@@ -39,7 +40,6 @@ from umf_ros.lab.training.objective import (
     resuming,
     save_checkpoint,
 )
-from umf_ros.networks.umf import count_parameters
 
 
 @dataclass(frozen=True, slots=True)
