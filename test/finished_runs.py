@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ from umf_ros.bags.sensor_check import SensorReport
 from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative
+from umf_ros.core.io import write_table
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.run_file import KEYFRAME
+from umf_ros.runs.run_file import COLUMNS, KEYFRAME, NAME, RunFile
 from umf_ros.runs.truth import JudgedRun, judge_closures
 from umf_ros.verification import Hypothesis, RejectReason
 
@@ -110,6 +112,11 @@ def examined(
     rows = keyframe_rows
     if rows is None:
         rows = [(stamp(second), 0, float(second)) for second in range(0, 80, 2)]
+    if not (folder / NAME).exists():
+        with closing(RunFile(folder)) as file, file.writing():
+            for number, row in enumerate(rows):
+                file.append_descriptor(row[0], np.eye(64)[number % 64])
+    write_table(folder / "latencies.csv", COLUMNS["latencies"], [(row[0], 30, 1, 9, 0, 40) for row in rows])
     run = FinishedRun(
         folder=folder,
         summary={**SUMMARY, **summary},

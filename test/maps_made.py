@@ -74,8 +74,8 @@ def made_map(path: Path, sessions: list[MadeSession], settings: Settings | None 
         run = folder.folder_of(made.name)
         run.mkdir(parents=True)
         with closing(RunFile(run)) as file:
-            for row, one in enumerate(made.drifting(number)):
-                file.append_odometry(row, one)
+            for one in made.drifting(number):
+                file.append_odometry(one)
         metres = range(made.first_m, made.last_m + 1)
         keyframes = [[made.stamp(metre), number, metre - made.first_m] for metre in metres]
         write_table(run / "keyframes.csv", COLUMNS["keyframes"], keyframes)

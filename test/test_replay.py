@@ -206,7 +206,7 @@ def test_a_replay_that_was_cut_off_ends_like_one_that_was_not(
         if count == frames_done:
             break
     cut._detector.database.close()  # the locks go with the process, and nothing else is left of it
-    cut._recorder._file._file.close()
+    cut._recorder._file.close()
     resumed = Replay(tmp_path / "cut", settings, LoopDetector(settings, ThumbnailEmbedder()), resume=True)
     list(resumed.run(stream))
     resumed.finish({})

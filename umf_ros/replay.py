@@ -84,11 +84,11 @@ class Replay:
         for item in items:
             if isinstance(item, OdometrySample):
                 self._has_odometry = True
-                self._recorder.record_odometry(item.stamp_ns, item.odom_T_body)
+                self._recorder.append_odometry(item)
                 self._feed.take(item.stamp_ns, item.odom_T_body)
                 continue
             if isinstance(item, AbsoluteMeasurement):
-                self._recorder.record_absolute(item)
+                self._recorder.append_absolute(item)
                 self._graph.add_absolute(item)
                 self._graph.update()
                 continue

@@ -93,9 +93,10 @@ def test_the_file_of_a_run_feeds_a_graph_with_them_in_order(tmp_path: Path) -> N
     fix = AbsoluteMeasurement(Aid.GNSS, START_NS + 1, PLACE, np.eye(3), np.zeros(3))
     with closing(RunFile(tmp_path)) as file:
         for number in range(4):
-            file.append_odometry(number, OdometrySample(START_NS + number * 10**9, np.eye(4)))
-        file.append_absolute(2, fix)
-        file.append_absolute(2, fix)  # as when a recording is played again
+            if number == 2:
+                file.append_absolute(fix)
+                file.append_absolute(fix)  # as when a recording is played again
+            file.append_odometry(OdometrySample(START_NS + number * 10**9, np.eye(4)))
         with file.writing():
             pass
         inputs = list(file.graph_inputs())

@@ -64,7 +64,7 @@ def drive(run: Path, last_m: int = LAST_M, first_m: int = FIRST_M) -> None:
                 match = MadeSession("one", 0, 90).stamp(metre)
                 closure = LoopClosure(stamp, match, np.eye(4), COVARIANCE, 0.99)
                 with file.writing():
-                    file.append("closures", [closure_row(closure, 0.9)], odometry_before=0)
+                    file.append("closures", [closure_row(closure, 0.9)])
 
 
 def stamps_in(folder: MapFolder) -> list[int]:

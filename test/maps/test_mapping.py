@@ -161,9 +161,9 @@ def test_a_narrow_lidar_joins_two_sessions_driven_in_opposite_directions(tmp_pat
         folder = target.folder_of(name)
         folder.mkdir(parents=True)
         with closing(RunFile(folder)) as file:
-            for row, one in enumerate(keyframes):
+            for one in keyframes:
                 assert one.odom_T_body is not None
-                file.append_odometry(row, OdometrySample(one.stamp_ns, one.odom_T_body, None))
+                file.append_odometry(OdometrySample(one.stamp_ns, one.odom_T_body, None))
         add_places(target, name, keyframes, ("none", 2), {"start_ns": keyframes[0].stamp_ns})
     out, back = target.sessions
     true = {one.stamp_ns: pose for one, pose in zip(outing.keyframes, outing.truth, strict=True)}

@@ -45,8 +45,8 @@ def folder(tmp_path: Path) -> MapFolder:
 @pytest.mark.parametrize("put", [messages(0, 1, 2, 3), TRACKED], ids=["messages", "tracked"])
 def test_odometry_is_read_back_as_it_was(folder: MapFolder, put: list[OdometrySample]) -> None:
     with closing(RunFile(folder.folder_of("a"))) as file:
-        for number, one in enumerate(put):
-            file.append_odometry(number, one)
+        for one in put:
+            file.append_odometry(one)
     got = folder.odometry_of("a")
     assert [one.stamp_ns for one in got] == [one.stamp_ns for one in put]
     for ours, theirs in zip(got, put, strict=True):

@@ -223,10 +223,6 @@ def test_descriptors_come_back_by_stamp(tmp_path: Path) -> None:
     np.testing.assert_allclose(found[40 * 10**9], make_keyframe(40, 40).embedding.descriptor, atol=2e-3)
 
 
-def test_a_run_of_an_older_release_has_no_descriptors(tmp_path: Path) -> None:
-    assert read_descriptors(tmp_path) == {}
-
-
 def test_nothing_but_the_file_of_the_run_and_its_exports_is_left(tmp_path: Path) -> None:
     record_a_little(tmp_path).close()
     read_descriptors(tmp_path)

@@ -141,8 +141,8 @@ def _track(folder: Path, settings: Settings) -> None:
     with writing(old):
         new.replace(old)
     with closing(RunFile(folder)) as file:
-        for number, one in enumerate(odometry):
-            file.append_odometry(number, one)
+        for one in odometry:
+            file.append_odometry(one)
 
 
 def track(keyframes: Iterable[Keyframe], settings: Verification) -> tuple[list[OdometrySample], list[Keyframe]]:
@@ -331,9 +331,9 @@ def _add_run(target: MapFolder, run: Path, new: list[Keyframe]) -> MapSession:
         rmtree(folder, ignore_errors=True)  # of a process that was killed
         folder.mkdir(parents=True)
     with closing(RunFile(folder)) as file:
-        for number, one in enumerate(new):
+        for one in new:
             assert one.odom_T_body is not None
-            file.append_odometry(number, OdometrySample(one.stamp_ns, one.odom_T_body))
+            file.append_odometry(OdometrySample(one.stamp_ns, one.odom_T_body))
     keyframes = [[one.stamp_ns, one.session, f"{one.path_length_m:.4f}"] for one in new]
     write_table(folder / "keyframes.csv", COLUMNS["keyframes"], keyframes)
     write_table(folder / "closures.csv", CLOSURES, [])

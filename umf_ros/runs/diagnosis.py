@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cache
-from math import inf, nan
+from math import inf
 from typing import Literal
 
 import numpy as np
@@ -102,26 +102,21 @@ def _gaps(about: JudgedRun, row: int, stamp: int) -> ClosureDiagnosis:
 
 def _retrieval(about: JudgedRun, row: int, allowed: np.ndarray, right: np.ndarray) -> ClosureDiagnosis:
     stamp, rules = int(about.run.stamps[row]), about.run.settings.loop
-    what, parameter = f"the database returned {len(about.tested[stamp])} candidates", ""
+    what = f"the database returned {len(about.tested[stamp])} candidates"
     if not len(right):
         return ClosureDiagnosis(stamp, "retrieval", what)
     rank, similarity, match = _best_rank(about.run.descriptors, row, allowed, right)
     distance = float(about.distances(row)[match])
     what += f", none of them the place {distance:.1f} m away"
-    if rank:
-        what += f", which has rank {rank} of {len(allowed)} by its similarity of {similarity:.2f}"
-        parameter = f"loop.top_k: {rank} (now {rules.top_k}); each candidate is reranked once more"
+    what += f", which has rank {rank} of {len(allowed)} by its similarity of {similarity:.2f}"
+    parameter = f"loop.top_k: {rank} (now {rules.top_k}); each candidate is reranked once more"
     if similarity < rules.min_similarity:
         parameter = f"loop.min_similarity: {similarity:.2f} (now {rules.min_similarity:g})"
     return ClosureDiagnosis(stamp, "retrieval", what, parameter, int(about.run.stamps[match]), distance)
 
 
-def _best_rank(
-    descriptors: np.ndarray | None, row: int, allowed: np.ndarray, right: np.ndarray
-) -> tuple[int, float, int]:
-    """Return the rank, similarity and row of the most similar right place; rank 0 without descriptors."""
-    if descriptors is None:
-        return 0, nan, int(right[0])
+def _best_rank(descriptors: np.ndarray, row: int, allowed: np.ndarray, right: np.ndarray) -> tuple[int, float, int]:
+    """Return the rank, similarity and row of the most similar right place."""
     similarities = descriptors @ descriptors[row]
     best = int(right[similarities[right].argmax()])
     return int((similarities[allowed] > similarities[best]).sum()) + 1, float(similarities[best]), best

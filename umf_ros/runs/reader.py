@@ -58,18 +58,15 @@ class FinishedRun:
         return self.keyframes["stamp_ns"]
 
     @cached_property
-    def descriptors(self) -> Points | None:
-        """(N, D) of the keyframes; None where an older version wrote none."""
+    def descriptors(self) -> Points:
+        """(N, D) of the keyframes."""
         found = run_file.read_descriptors(self.folder)
-        stamps = self.stamps.tolist()
-        return np.stack([found[stamp] for stamp in stamps]) if stamps and found.keys() >= set(stamps) else None
+        return np.array([found[stamp] for stamp in self.stamps.tolist()], np.float32)
 
     @cached_property
     def latencies_ms(self) -> dict[int, float]:
         """Latency of each keyframe in ms, by its stamp."""
         path = self.folder / "latencies.csv"
-        if not path.is_file():
-            return {}
         return dict(run_file.read_table(path, lambda row: (int(row["stamp_ns"]), float(row["total"]))))
 
 

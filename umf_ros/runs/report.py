@@ -244,16 +244,16 @@ def _facts(summary: Summary) -> list[tuple[str, str]]:
 
 
 def _revisits(truth: Summary) -> str:
-    """Return the numbers of revisits and of those with a closure; older runs lack the latter."""
-    again, closed = truth.get("revisits_any_heading"), truth.get("closed_any_heading")
-    if not again or closed is None:
+    """Return the numbers of revisits and of those with a closure."""
+    again, closed = truth["revisits_any_heading"], truth["closed_any_heading"]
+    if not again:
         return str(truth["revisits"])
     return f"{truth['revisits']} in the same direction; {again} from any side, {closed} of them closed"
 
 
 def _consistency(truth: Summary) -> str:
-    """Return a comparison of the closures' covariances with their errors; older runs lack it."""
-    median, inside = truth.get("nees_median"), truth.get("inside_95")
+    """Return a comparison of the closures' covariances with their errors."""
+    median, inside = truth["nees_median"], truth["inside_95"]
     if median is None or inside is None:
         return "not judged: no closure, or a truth without orientations"
     return (

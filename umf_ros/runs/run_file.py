@@ -113,6 +113,7 @@ class RunFile:
         if not read_only and not self._path.exists():
             _set_aside(folder)
         self._file = SqliteFile(self._path, SCHEMA, read_only=read_only)
+        self._received = 0
         self._odometry: deque[tuple[int, int, bytes, bytes | None]] = deque()
         self._absolute: list[tuple[str, int, int, bytes]] = []
 
@@ -126,11 +127,12 @@ class RunFile:
         self._odometry.clear()
         self._absolute.clear()
 
-    def append(self, table: str, rows: Iterable[Sequence[Any]], **more: Any) -> None:
-        """Add rows to a table, within a transaction; `more` are values of columns that are not exported."""
-        columns = [*COLUMNS[table], *more]
+    def append(self, table: str, rows: Iterable[Sequence[Any]]) -> None:
+        """Add rows to a table, within a transaction; closures with the number of odometry messages before them."""
+        before = {"odometry_before": self._received} if table == "closures" else {}
+        columns = [*COLUMNS[table], *before]
         statement = f"INSERT INTO {table} ({', '.join(columns)}) VALUES ({', '.join('?' * len(columns))})"
-        self._file.connection.executemany(statement, ([*row, *more.values()] for row in rows))
+        self._file.connection.executemany(statement, ([*row, *before.values()] for row in rows))
 
     def append_descriptor(self, stamp_ns: int, descriptor: Points) -> None:
         """Add the descriptor (D,) of a keyframe in half precision, within a transaction."""
@@ -142,16 +144,18 @@ class RunFile:
         values = (*picture[:4], picture.scan.astype("<i2").tobytes())
         self._file.connection.execute("INSERT INTO picture VALUES (?, ?, ?, ?, ?)", values)
 
-    def append_odometry(self, number: int, odometry: OdometrySample) -> None:
-        """Add the n-th odometry of the recording with the next transaction; a known one stays."""
+    def append_odometry(self, odometry: OdometrySample) -> None:
+        """Add the next odometry of the recording with the next transaction; a known one stays."""
         stamp_ns, pose, covariance = odometry
         spread = None if covariance is None else np.ascontiguousarray(covariance, np.float64).tobytes()
-        self._odometry.append((number, stamp_ns, np.ascontiguousarray(pose[:3], np.float64).tobytes(), spread))
+        numbers = np.ascontiguousarray(pose[:3], np.float64).tobytes()
+        self._odometry.append((self._received, stamp_ns, numbers, spread))
+        self._received += 1
 
-    def append_absolute(self, odometry_before: int, measurement: AbsoluteMeasurement) -> None:
-        """Add a measurement, after so many odometry messages, with the next transaction; a known one stays."""
+    def append_absolute(self, measurement: AbsoluteMeasurement) -> None:
+        """Add the next measurement of the recording with the next transaction; a known one stays."""
         numbers = np.ascontiguousarray(measurement.numbers, np.float64).tobytes()
-        self._absolute.append((measurement.source.value, measurement.stamp_ns, odometry_before, numbers))
+        self._absolute.append((measurement.source.value, measurement.stamp_ns, self._received, numbers))
 
     def note(self, **values: Any) -> None:
         """Write facts about the run by name, within a transaction."""
@@ -239,9 +243,7 @@ def _set_aside(folder: Path) -> None:
 
 
 def read_descriptors(folder: Path) -> dict[int, Points]:
-    """Return the descriptors (D,) float32 of the keyframes of a run by stamp, in order; empty for an older release."""
-    if not (folder / NAME).is_file():
-        return {}
+    """Return the descriptors (D,) float32 of the keyframes of a run by stamp, in order."""
     with closing(RunFile(folder, read_only=True)) as file:
         return file.descriptors()
 

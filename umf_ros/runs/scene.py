@@ -19,7 +19,7 @@ from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, contributions, explain, missing, most_probable
 from umf_ros.runs.findings import explain_missed
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.run_file import NAME, SCAN_UNIT_M, Endpoints, Picture, RunFile
+from umf_ros.runs.run_file import SCAN_UNIT_M, Endpoints, Picture, RunFile
 from umf_ros.runs.truth import JudgedRun, pose_in_truth, positions_in_truth
 from umf_ros.verification.hypothesis import Hypothesis
 
@@ -206,8 +206,6 @@ def read_pictures(
     """Return the pictures of a run whose stamps are `shown`, and its scans along a trajectory as a map from above."""
     pictures: dict[int, Picture] = {}
     heights = HeightMap(drawn.poses[:, :2, 3]) if drawn is not None and len(drawn) else None
-    if not (folder / NAME).is_file():  # of an earlier release
-        return pictures, heights
     with closing(RunFile(folder, read_only=True)) as file:
         for picture in file.pictures():
             if picture.stamp_ns in shown:
@@ -350,8 +348,8 @@ def _positions(about: JudgedRun) -> Array:
     return 10 * np.column_stack([np.sin(angle), np.cos(angle)])[: len(stamps)]
 
 
-def _similarity(descriptors: Points | None) -> dict[str, Any] | None:
-    if descriptors is None or not len(descriptors):
+def _similarity(descriptors: Points) -> dict[str, Any] | None:
+    if not len(descriptors):
         return None
     rows = evenly(len(descriptors), MAX_SIDE)
     matrix = np.clip(np.rint(100 * descriptors[rows] @ descriptors[rows].T), -100, 100).astype("<i1")

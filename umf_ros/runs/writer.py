@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 
 from umf_ros import __version__
-from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, Keyframe
@@ -36,7 +35,6 @@ from umf_ros.runs.run_file import (
     inlier_rows,
     pose_numbers,
 )
-from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import Input
 from umf_ros.sensors.synchronizer import InputCounter
 
@@ -95,7 +93,7 @@ def _note(folder: Path, **values: Any) -> None:
         file.note(**values)
 
 
-class RunRecorder:
+class RunRecorder(RunFile):
     """Writer of a run: `config.yaml` at once, `run.sqlite` keyframe by keyframe, CSV tables and `summary.json` last.
 
     A folder of an earlier process is continued: rows and counts of both are kept, and a stored
@@ -116,19 +114,18 @@ class RunRecorder:
     """
 
     def __init__(self, folder: Path, settings: Settings, weights: str, resume: bool = False) -> None:
-        self.folder, self._settings, self._weights = folder, settings, weights
+        self._settings, self._weights = settings, weights
         write_atomically(folder / "config.yaml", dump_settings(settings))
-        self._file = RunFile(folder)
-        self.recorded = {(int(row[0]), int(row[1])) for row in self._file.rows("keyframes")}
-        self.earlier_closures = self._file.closures()
+        super().__init__(folder)
+        self.recorded = {(int(row[0]), int(row[1])) for row in self.rows("keyframes")}
+        self.earlier_closures = self.closures()
         self._pairs = {closure.endpoints for closure in self.earlier_closures}
-        latencies = self._file.rows("latencies")
+        latencies = self.rows("latencies")
         self._latency = {
             stage: array("f", (value for row in latencies if not isnan(value := float(row[place]))))
             for place, stage in enumerate(STAGES, 1)
         }
         self._counts = self._earlier_counts(resume)
-        self._odometry = 0
         self._started = time.monotonic()
         self._recorded_ns = 0
         self._last_stamp_ns: int | None = None
@@ -147,15 +144,15 @@ class RunRecorder:
         new = [one for one in accepted if one.endpoints not in self._pairs]
         times = [f"{detection.latency_ms.get(stage, nan):.1f}" for stage in STAGES]
         closures = [closure_row(one.closure, one.candidate.similarity) for one in new if one.closure]
-        with self._file.writing():
-            self._file.append("keyframes", [[stamp_ns, keyframe.session, f"{keyframe.path_length_m:.4f}"]])
-            self._file.append("latencies", [[stamp_ns, *times]])
-            self._file.append_descriptor(stamp_ns, keyframe.embedding.descriptor)
-            self._file.append_picture(picture_of(frame, keyframe))
-            self._file.append("candidates", [candidate_row(one) for one in detection.verdicts])
-            self._file.append("closures", closures, odometry_before=self._odometry)
-            self._file.append("inliers", [row for one in new for row in inlier_rows(one)])
-            self._file.note(**self._facts())
+        with self.writing():
+            self.append("keyframes", [[stamp_ns, keyframe.session, f"{keyframe.path_length_m:.4f}"]])
+            self.append("latencies", [[stamp_ns, *times]])
+            self.append_descriptor(stamp_ns, keyframe.embedding.descriptor)
+            self.append_picture(picture_of(frame, keyframe))
+            self.append("candidates", [candidate_row(one) for one in detection.verdicts])
+            self.append("closures", closures)
+            self.append("inliers", [row for one in new for row in inlier_rows(one)])
+            self.note(**self._facts())
         self._counts["keyframes"] += 1
         self._counts["queries"] += bool(detection.verdicts)
         self._counts["closures_rejected"] += len(detection.verdicts) - len(accepted)
@@ -165,26 +162,17 @@ class RunRecorder:
         for stage, milliseconds in detection.latency_ms.items():
             self._latency[stage].append(milliseconds)
 
-    def record_odometry(self, stamp_ns: int, odom_T_body: Array) -> None:
-        """Write the next odometry message of the recording, with the next keyframe."""
-        self._file.append_odometry(self._odometry, OdometrySample(stamp_ns, odom_T_body))
-        self._odometry += 1
-
-    def record_absolute(self, measurement: AbsoluteMeasurement) -> None:
-        """Write the next absolute measurement of the recording, with the next keyframe."""
-        self._file.append_absolute(self._odometry, measurement)
-
     def record_inter_robot(self, inter_closure: InterRobotClosure) -> None:
         """Write the closures with another rover of a fleet."""
         rows = [[inter_closure.robot, *closure_row(one, nan)] for one in inter_closure.closures]
-        with self._file.writing():
-            self._file.append("closures_between", rows)
+        with self.writing():
+            self.append("closures_between", rows)
 
     def record_pose(self, stamp_ns: int, map_T_body: Array, covariance: Array, probability: float) -> None:
         """Write a pose in the map to `localization.csv`; its covariance (6, 6) is in ROS order."""
         numbers = *pose_numbers(map_T_body, covariance), probability
-        with self._file.writing():
-            self._file.append("localization", [[stamp_ns, *(f"{number:.6g}" for number in numbers)]])
+        with self.writing():
+            self.append("localization", [[stamp_ns, *(f"{number:.6g}" for number in numbers)]])
 
     def count(self, frame: Frame) -> None:
         """Count a frame, including frames processed before."""
@@ -208,16 +196,16 @@ class RunRecorder:
 
     def write_summary(self, drops: Mapping[str, int]) -> None:
         """Write `summary.json`; may be called again as the run goes on."""
-        write_summary(self.folder, self.summary(drops))
+        write_summary(self._folder, self.summary(drops))
 
     def close(self) -> None:
         """Export the CSV tables, and close the file."""
         try:
-            self._file.export(self._settings.localizing)
-            with self._file.writing():
-                self._file.note(**(self._facts() | {"exported": True}))
+            self.export(self._settings.localizing)
+            with self.writing():
+                self.note(**(self._facts() | {"exported": True}))
         finally:
-            self._file.close()
+            super().close()
 
     def _facts(self) -> dict[str, Any]:
         """Return the facts about a run that `umf report` reads from the file of a killed process."""
@@ -226,8 +214,8 @@ class RunRecorder:
 
     def _earlier_counts(self, resume: bool) -> dict[str, int]:
         """Count the rows in the file; all frames of a resumed recording are counted again."""
-        facts = self._file.facts() if not resume else {}
-        candidates = self._file.rows("candidates")
+        facts = self.facts() if not resume else {}
+        candidates = self.rows("candidates")
         return {
             "frames": int(facts.get("frames", 0)),
             "pairs": int(facts.get("pairs", 0)),
