@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from hypothesis import settings
-from processes import Process
 
 from umf_ros.core.frames import Embedding, Frame, Keyframe, LocalFeatures, StereoCamera, SuperFeatures
 from umf_ros.core.geometry import make_pose
@@ -103,6 +102,8 @@ def make_frame(stamp_s: float, odom_T_body: np.ndarray | None = None, session: i
 @pytest.fixture(autouse=True)
 def no_node_is_left() -> Iterator[None]:
     """End the nodes of a test that failed: the tests after it share their domain with them."""
+    from processes import Process  # its environment has the domain that is chosen above
+
     before = len(Process.started)
     yield
     for process in Process.started[before:]:
