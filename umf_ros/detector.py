@@ -314,7 +314,7 @@ class LoopDetector:
         self._network.shutdown(cancel_futures=True)
         self._verifier.reset()
         if self.inter_robot is not None:
-            self.inter_robot.close()
+            self.inter_robot.link.close()
         self.database.close()
         if self.seen is not None:
             self.seen.close()

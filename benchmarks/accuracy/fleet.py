@@ -90,8 +90,7 @@ class Rover:
         self.link = CuttableLink(server.port)
         address = server.address(self.name, self.link.port)
         self._database = Database(path=str(folder / f"{self.name}.sqlite"), backend="postgres", server=address)
-        known = {"embedder": identity[0], "dimension": str(identity[1])}
-        self.store = KeyframeStore(Path(self._database.path), known, 400, outgoing=True)
+        self.store = KeyframeStore(Path(self._database.path), identity, 400, outgoing=True)
         self.submaps = SubmapHistory(self.store)
         self.inter_robot = InterRobotMatcher(Settings(database=self._database), self.submaps, identity)
 
@@ -273,7 +272,7 @@ def measure(folder: MapFolder, places: int, seed: int) -> dict[str, Any]:
                 row = connection.execute("SELECT count(*) FROM place").fetchone()
             figures["places"] = row[0] if row else 0
             for rover in rovers:
-                rover.inter_robot.close()
+                rover.inter_robot.link.close()
                 rover.store.close()
     return {name: round(value, 2) if isinstance(value, float) else value for name, value in figures.items()}
 

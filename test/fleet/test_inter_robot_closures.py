@@ -46,7 +46,7 @@ def drive(server: PostgresServer, rover: str) -> list[InterRobotClosure]:
     for place, pose in enumerate(poses_of(rover)):
         inter_robot.link.enqueue(places.add(seen(pose, 10.0 * place, place, 10.0 * place)))
     found = list(inter_robot.finish(60))
-    inter_robot.close()
+    inter_robot.link.close()
     places.close()
     return found
 
@@ -86,7 +86,7 @@ def narrow_drive(
         inter_robot.link.enqueue(places.add(keyframe))
         history.add(keyframe)
     found = list(inter_robot.finish(120))
-    inter_robot.close()
+    inter_robot.link.close()
     places.close()
     return found
 

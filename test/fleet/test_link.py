@@ -83,7 +83,7 @@ def test_keyframes_around_a_candidate_are_fetched_one_of_every_step(server: Post
     drive(ada_places, ada, [make_keyframe(500, 3.0, seed=60)])
     assert ada.drain(20)
     (answer,) = answers_of(ada)
-    ada.enqueue_around(answer._replace(found=answer.found[:1]))
+    ada.enqueue(answer._replace(found=answer.found[:1]))
     assert ada.drain(20)
     (answer,) = answers_of(ada)
     ((_, match),) = answer.found
@@ -118,7 +118,7 @@ def test_a_disconnected_rover_continues_and_pushes_after_the_next_start(
         link = link_of(places, server, "ada", free_port())
         drive(places, link, keyframes(5))
         until(lambda: bool(link.trouble))
-        assert not link.connected and not link.drain(0.1) and link.waiting() == 5
+        assert not link.connected and not link.drain(0.1) and places.store.waiting() == 5
         link.close()
     assert "cannot be reached" in caplog.text and "secret" not in caplog.text
     places.close()

@@ -47,7 +47,7 @@ def test_odometry_is_read_back_as_it_was(folder: MapFolder, put: list[OdometrySa
     with closing(RunFile(folder.folder_of("a"))) as file:
         for one in put:
             file.append_odometry(one)
-    got = folder.odometry_of("a")
+    got, _ = folder.inputs_of("a")
     assert [one.stamp_ns for one in got] == [one.stamp_ns for one in put]
     for ours, theirs in zip(got, put, strict=True):
         np.testing.assert_array_equal(ours.odom_T_body, theirs.odom_T_body)
@@ -71,4 +71,4 @@ def test_tracked_poses_keep_their_sessions() -> None:
 
 def test_a_session_without_its_run_is_refused(folder: MapFolder) -> None:
     with pytest.raises(UmfError, match=r"there is no run .*run\.sqlite"):
-        folder.odometry_of("a")
+        folder.inputs_of("a")

@@ -11,7 +11,7 @@ from tiny_worlds import TINY, some_input
 
 from umf_ros.core.errors import WeightsError
 from umf_ros.lab.training.networks import PRESETS, read_card, save_weights
-from umf_ros.networks.config import SHIPPED, NetworkConfig, locate_weights
+from umf_ros.networks.config import DEFAULT, NetworkConfig, locate_weights
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
 
@@ -60,8 +60,7 @@ def test_eight_bits_take_half_the_space_and_say_nearly_the_same(tmp_path):
 def test_shipped_weights_are_known_by_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert locate_weights(None) == locate_weights(Path("umf_scene"))
-    for name in SHIPPED:
-        assert load_weights(locate_weights(Path(name))).config == PRESETS[name]
+    assert load_weights(locate_weights(None)).config == PRESETS[DEFAULT]
     assert locate_weights(tmp_path / "umf_light") == tmp_path / "umf_light"
 
 

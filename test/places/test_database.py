@@ -140,7 +140,7 @@ def test_a_duplicate_is_found_and_another_keyframe_of_its_stamp_is_not() -> None
 def test_saving_copies_everything(tmp_path: Path) -> None:
     places = database()
     places.add(make_keyframe(1))
-    places.save(tmp_path / "sub" / "copy.sqlite")
+    places.store.save(tmp_path / "sub" / "copy.sqlite")
     places.add(make_keyframe(2))
     assert len(database(tmp_path / "sub" / "copy.sqlite")) == 1
 
@@ -162,7 +162,7 @@ def test_a_foreign_file_is_refused(tmp_path: Path) -> None:
 def test_an_unwritable_copy_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
-        database().save(tmp_path / "file" / "copy.sqlite")
+        database().store.save(tmp_path / "file" / "copy.sqlite")
 
 
 def test_places_of_named_sessions_are_found_whatever_their_age(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def test_a_killed_process_leaves_an_index_that_is_completed(tmp_path: Path, rng:
     places = database(path)
     fill(places, rows)
     (copy := tmp_path / "killed").mkdir()
-    places.save(copy / "map.sqlite")
+    places.store.save(copy / "map.sqlite")
     index_path(copy / "map.sqlite").write_bytes(index_path(path).read_bytes())  # of the first 1000 or so
     survivor = database(copy / "map.sqlite")
     assert len(survivor.index) == 1300 and [best(survivor, rows[i])[0][0] for i in (3, 1299)] == [3, 1299]
@@ -211,7 +211,7 @@ def test_a_search_leaves_the_threads_of_the_network_alone() -> None:
 
 
 def test_a_store_of_half_its_descriptors_is_damage_and_not_a_crash(tmp_path: Path) -> None:
-    opened = KeyframeStore(tmp_path / "map.sqlite", {"embedder": "test", "dimension": "16"}, 20)
+    opened = KeyframeStore(tmp_path / "map.sqlite", ("test", 16), 20)
     opened.add(make_keyframe(0, descriptor=np.ones(8, np.float32)))
     opened.close()
     with pytest.raises(Exception, match=r"map\.sqlite is damaged"):

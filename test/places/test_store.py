@@ -21,7 +21,7 @@ from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import KeyframeStore
 
-IDENTITY = {"embedder": "test", "dimension": "16"}
+IDENTITY = ("test", 16)
 RULES = Loop(min_similarity=-1, min_time_gap_s=20, min_travel_m=15, top_k=50)
 
 
@@ -140,7 +140,7 @@ FILL = """
 import sys
 from pathlib import Path
 path = Path(sys.argv[1]) if len(sys.argv) > 1 else None
-store = KeyframeStore(path, {"embedder": "test", "dimension": "16"}, 20)
+store = KeyframeStore(path, ("test", 16), 20)
 for i in range(10**6):
     store.add(make_keyframe(i, seed=i))
     if i == 20:
@@ -173,7 +173,7 @@ def test_a_killed_process_loses_no_keyframe_and_holds_no_lock(tmp_path: Path) ->
 def test_a_file_that_was_refused_can_be_opened_later(tmp_path: Path) -> None:
     path = filled(tmp_path / "map.sqlite")
     with pytest.raises(UmfError, match="made with"):
-        KeyframeStore(path, IDENTITY | {"dimension": "99"}, 20)
+        KeyframeStore(path, ("test", 99), 20)
     assert len(database(path)) == 5
 
 
@@ -231,11 +231,11 @@ def test_an_empty_file_becomes_a_database(tmp_path: Path) -> None:
     assert len(database(path)) == 2
 
 
-@pytest.mark.parametrize("change_to", ["dimension", "embedder"])
-def test_another_embedder_is_refused_with_both_names(tmp_path: Path, change_to: str) -> None:
+@pytest.mark.parametrize(("other", "said"), [(("test", 99), "dimension 16"), (("99", 16), "embedder test")])
+def test_another_embedder_is_refused_with_both_names(tmp_path: Path, other: tuple[str, int], said: str) -> None:
     path = filled(tmp_path / "map.sqlite", 1)
-    with pytest.raises(UmfError, match=rf"map\.sqlite was made with {change_to} (16|test), not 99$"):
-        KeyframeStore(path, IDENTITY | {change_to: "99"}, 20)
+    with pytest.raises(UmfError, match=rf"map\.sqlite was made with {said}, not 99$"):
+        KeyframeStore(path, other, 20)
 
 
 @pytest.mark.parametrize("data", [b"\x00\x01", "text where bytes belong"])
@@ -292,7 +292,7 @@ def test_a_copy_is_complete_although_the_log_was_not_written_back(tmp_path: Path
     places = database(tmp_path / "map.sqlite")
     for i in range(7):
         places.add(make_keyframe(i, seed=i))
-    places.save(tmp_path / "copy.sqlite")
+    places.store.save(tmp_path / "copy.sqlite")
     # one file is all of it: no log beside it is needed
     shutil.move(tmp_path / "copy.sqlite", tmp_path / "elsewhere.sqlite")
     copied = database(tmp_path / "elsewhere.sqlite")
@@ -304,5 +304,5 @@ def test_a_copy_replaces_an_older_one(tmp_path: Path) -> None:
     target = filled(tmp_path / "copy.sqlite", 9)
     places = database(tmp_path / "map.sqlite")
     places.add(make_keyframe(1))
-    places.save(target)
+    places.store.save(target)
     assert len(database(target)) == 1

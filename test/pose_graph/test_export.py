@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,12 +29,12 @@ from umf_ros.lab.datasets.g2o import (
     as_recording,
     drive,
     read_g2o,
-    verdicts_by_vertex,
     write_optimised,
     write_plane,
+    write_verdicts_by_vertex,
 )
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.pose_graph.closures import VERDICT_COLUMNS, verdict_table
+from umf_ros.pose_graph.closures import VERDICT_COLUMNS
 
 WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))
 
@@ -54,8 +53,10 @@ def test_results_hold_both_trajectories_for_evaluation(finished: PoseGraph, tmp_
     np.testing.assert_array_equal(optimized.stamps_ns, np.arange(2 * LAP) * PERIOD_NS)
 
 
-def test_the_verdict_table_says_why(finished: PoseGraph) -> None:
-    rows = list(csv.DictReader(io.StringIO(verdict_table(finished.closures()))))
+def test_the_verdict_table_says_why(finished: PoseGraph, tmp_path: Path) -> None:
+    finished.write_results(tmp_path)
+    with (tmp_path / "graph_verdicts.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == VERDICT_COLUMNS
     assert len(rows) == len(WORLD.closures)
     (bad,) = [row for row in rows if row["verdict"] == "rejected"]
@@ -110,7 +111,9 @@ def test_vertices_keep_the_ids_of_their_file(tmp_path: Path) -> None:
         (100, 150),
     ]
     assert not (tmp_path / "out.csv").exists()
-    rows = list(csv.DictReader(io.StringIO(verdicts_by_vertex(graph, recording))))
+    write_verdicts_by_vertex(tmp_path / "verdicts.csv", graph, recording)
+    with (tmp_path / "verdicts.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
     assert [(row["match"], row["query"]) for row in rows] == [("100", "150")]
 
 

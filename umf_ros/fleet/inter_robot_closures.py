@@ -153,7 +153,7 @@ class InterRobotMatcher:
             best = max(verdicts, key=lambda one: one.probability or 0.0).candidate.index
             found = [one for one in answer.found if one[0].index == best and can_be_merged(one[1])]
             if found:
-                self.link.enqueue_around(answer._replace(found=found))
+                self.link.enqueue(answer._replace(found=found))
 
     def _compare_submaps(self, answer: Answer, verifier: Verifier, consensus: FleetConsensus) -> list[Hypothesis]:
         ((candidate, match),), store = answer.found, self._submaps.store
@@ -176,7 +176,3 @@ class InterRobotMatcher:
                 yield found
             if drained or time.monotonic() > end:
                 return
-
-    def close(self) -> None:
-        """Disconnect from the server."""
-        self.link.close()

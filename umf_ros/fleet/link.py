@@ -76,14 +76,9 @@ class FleetLink:
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
         self._thread.start()
 
-    def enqueue(self, row: int) -> None:
-        """Push and query a keyframe that was stored."""
-        self._asks.append(row)
-        self._work.set()
-
-    def enqueue_around(self, answer: Answer) -> None:
-        """Query the keyframes around the only candidate of an answer; they come as another answer."""
-        self._asks.append(answer)
+    def enqueue(self, asked: int | Answer) -> None:
+        """Push and query a stored keyframe; or query those around an answer's only candidate, for another answer."""
+        self._asks.append(asked)
         self._work.set()
 
     def answer(self) -> Answer | None:
@@ -92,10 +87,6 @@ class FleetLink:
             return None
         self._work.set()
         return self._answers.popleft()
-
-    def waiting(self) -> int:
-        """Return the number of places that are not pushed yet."""
-        return self._store.waiting()
 
     def drain(self, timeout_s: float) -> bool:
         """Wait until all is pushed and queried; return whether it is. Answers have to be taken meanwhile."""

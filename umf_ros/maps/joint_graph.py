@@ -74,12 +74,13 @@ def solve(folder: MapFolder, edits: Mapping[tuple[int, int], State] | None = Non
         UmfError: a file of the map is missing or damaged, or an edit is about no closure of the map.
     """
     graph = PoseGraph(folder.settings.pose_graph)
-    odometry = {session.name: folder.odometry_of(session.name) for session in folder.sessions}
+    odometry: dict[str, list[OdometrySample]] = {}
     for number, session in enumerate(folder.sessions):
         if number:
             graph.begin_session()
+        odometry[session.name], measurements = folder.inputs_of(session.name)
         feed(graph, (one._replace(stamp_ns=one.stamp_ns + session.shift_ns) for one in odometry[session.name]))
-        for one in folder.measurements_of(session.name):
+        for one in measurements:
             graph.add_absolute(replace(one, stamp_ns=one.stamp_ns + session.shift_ns))
     # after all odometry, as a closure may refer to any session
     for session in folder.sessions:

@@ -109,15 +109,12 @@ class MapFolder:
         """Run folder of a recording, stamped by its own clock."""
         return self.path / "sessions" / name
 
-    def odometry_of(self, name: str) -> list[OdometrySample]:
-        """Return the odometry of a recording, stamped by its own clock."""
+    def inputs_of(self, name: str) -> tuple[list[OdometrySample], list[AbsoluteMeasurement]]:
+        """Return the odometry and the absolute measurements of a recording, stamped by its own clock."""
         with closing(RunFile(self.folder_of(name), read_only=True)) as file:
-            return list(file.odometry())
-
-    def measurements_of(self, name: str) -> list[AbsoluteMeasurement]:
-        """Return the absolute measurements of a recording, stamped by its own clock."""
-        with closing(RunFile(self.folder_of(name), read_only=True)) as file:
-            return [one for one in file.graph_inputs() if isinstance(one, AbsoluteMeasurement)]
+            inputs = list(file.graph_inputs())
+        measurements = [one for one in inputs if isinstance(one, AbsoluteMeasurement)]
+        return [one for one in inputs if isinstance(one, OdometrySample)], measurements
 
     def session_at(self, map_ns: int) -> MapSession | None:
         """Return the recording that covers a stamp of the map's clock."""

@@ -206,7 +206,7 @@ def add_places(
     _discard_unfinished(target)
     with closing(PlaceDatabase(Database(path=str(target.places)), *identity)) as places:
         first_place, first_number = len(places), places.next_session
-        odometry = target.odometry_of(name)
+        odometry, _ = target.inputs_of(name)
         known = list(known)
         stamps = [keyframe.stamp_ns for keyframe in known] or [recording["start_ns"]]
         span = [*stamps, *(one.stamp_ns for one in odometry)]

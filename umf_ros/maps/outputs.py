@@ -18,14 +18,14 @@ from scipy.spatial import cKDTree
 from umf_ros.core.config import TerrainSettings
 from umf_ros.core.errors import UmfError, reading, writing
 from umf_ros.core.geometry import Array, evenly, first_of_cubes, invert, transform
-from umf_ros.core.io import atomic_write, write_atomically
+from umf_ros.core.io import atomic_write, write_atomically, write_table
 from umf_ros.core.trajectory import Trajectory, write_geojson, write_tum
 from umf_ros.localizer import POSES, read_poses
 from umf_ros.maps.joint_graph import JointMap, JointSession
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import stored_identity
-from umf_ros.pose_graph.closures import State, verdict_table
+from umf_ros.pose_graph.closures import VERDICT_COLUMNS, State, verdict_rows
 from umf_ros.runs.report import plot_trajectories, render
 from umf_ros.runs.scene import HeightMap, data_address
 from umf_ros.terrain.grid import write_terrain
@@ -53,7 +53,7 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     trajectories = path / "trajectories"
     with writing(f"to {path}"):
         trajectories.mkdir(exist_ok=True)
-        (path / "graph_verdicts.csv").write_text(verdict_table(joint.graph.closures()), encoding="utf-8")
+    write_table(path / "graph_verdicts.csv", VERDICT_COLUMNS, verdict_rows(joint.graph.closures()))
     for one in joint.sessions:
         write_tum(trajectories / f"{one.session.name}.tum", Trajectory(one.stamps, one.poses))
     joint.graph.write_g2o(path / "graph.g2o")

@@ -132,14 +132,13 @@ class NetworkInput(NamedTuple):
         return type(self)(*(tensor.to(device) for tensor in self))
 
 
-SHIPPED = ("umf_scene",)
 DEFAULT = "umf_scene"
 
 
 def locate_weights(weights: Path | None) -> Path:
-    """Return a weights file: as given, by the name of shipped weights, or the default for None."""
+    """Return a weights file: as given, or the shipped one by its name or for None."""
     name = DEFAULT if weights is None else str(weights)
-    return find(f"models/{name}.safetensors") if name in SHIPPED else Path(name)
+    return find(f"models/{name}.safetensors") if name == DEFAULT else Path(name)
 
 
 def read_config(path: Path) -> NetworkConfig:

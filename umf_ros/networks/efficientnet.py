@@ -87,9 +87,8 @@ class EfficientNetLite0(nn.Module):
             inputs = channels
         self.channels = [STAGES[end].channels for end in ENDS if end < depth]
         for module in self.modules():
-            if (
-                isinstance(module, nn.Conv2d) and module.bias is not None
-            ):  # without normalisation, the default initialisation lets the signal vanish
+            # without normalisation, the default initialisation lets the signal vanish
+            if isinstance(module, nn.Conv2d) and module.bias is not None:
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(module.bias)
 

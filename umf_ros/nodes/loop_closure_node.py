@@ -218,13 +218,13 @@ class LoopClosureNode(BaseNode):
         """Return the state of the link to the fleet's server, if there is one."""
         if self._detector.inter_robot is None:
             return {}
-        link = self._detector.inter_robot.link
-        known = {"fleet_connected": link.connected, "fleet_waiting": link.waiting(), "fleet_pushed": link.pushed}
+        link, waiting = self._detector.inter_robot.link, self._detector.database.store.waiting()
+        known = {"fleet_connected": link.connected, "fleet_waiting": waiting, "fleet_pushed": link.pushed}
         return {**known, "fleet_closures": self._between, "fleet_trouble": link.trouble or "none"}
 
     def _save(self, _: Any) -> str:
         path = Path(self._settings.database.path or "places.sqlite").with_suffix(".saved.sqlite").resolve()
-        self._detector.database.save(path)
+        self._detector.database.store.save(path)
         return f"{len(self._detector.database)} places saved to {path}"
 
     def _reset(self, _: Any) -> str:

@@ -89,9 +89,8 @@ class PlaceDatabase:
 
     def __init__(self, settings: Database, embedder: str, dimension: int, read_only: bool = False) -> None:
         path = Path(settings.path) if settings.path else None
-        identity = {"embedder": embedder, "dimension": str(dimension)}
         outgoing = settings.backend == "postgres" and not read_only
-        self.store = KeyframeStore(path, identity, settings.cached_keyframes, read_only, outgoing)
+        self.store = KeyframeStore(path, (embedder, dimension), settings.cached_keyframes, read_only, outgoing)
         self._index_path = index_path(path) if path is not None else None
         self.listed: range | None = None
         try:
@@ -181,10 +180,6 @@ class PlaceDatabase:
             return np.asarray((keys["session"] >= sessions.start) & (keys["session"] < sessions.stop))
         age_ns, path_m = keyframe.stamp_ns - keys["stamp_ns"], keyframe.path_length_m - keys["travelled_m"]
         return is_past(age_ns, path_m, rules, keys["session"] == keyframe.session)
-
-    def save(self, path: Path) -> None:
-        """Write a copy of the keyframes to `path`."""
-        self.store.save(path)
 
     def close(self) -> None:
         """Close the files."""

@@ -79,19 +79,20 @@ class KeyframeStore:
     """
 
     def __init__(
-        self, path: Path | None, identity: dict[str, str], cached: int, read_only: bool = False, outgoing: bool = False
+        self, path: Path | None, identity: tuple[str, int], cached: int, read_only: bool = False, outgoing: bool = False
     ) -> None:
         self.path, self.read_only = path, read_only
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, Keyframe] = OrderedDict()
-        self._cached, self._dimension, self._outgoing = cached, int(identity["dimension"]), outgoing
+        self._cached, self._dimension, self._outgoing = cached, identity[1], outgoing
         name = str(path)
         self._file = SqliteFile(path, SCHEMA, read_only=read_only, check=lambda db: _check_identity(db, name, identity))
         try:
             with self._reading() as connection:
                 if not connection.execute("SELECT 1 FROM about").fetchone():
                     with self._file.writing():
-                        connection.execute("INSERT INTO about VALUES (?)", (json.dumps(identity),))
+                        about = json.dumps({"embedder": identity[0], "dimension": str(identity[1])})
+                        connection.execute("INSERT INTO about VALUES (?)", (about,))
                 if outgoing:
                     self._file.migrate(OUTBOX)
                 self._keys = _read_keys(connection)
@@ -278,8 +279,7 @@ def stored_sessions(path: Path) -> list[StoredSession]:
 def stored_identity(path: Path) -> tuple[str, int]:
     """Return the embedder and numbers per descriptor of a place database; another process may write it."""
     with _open_read_only(path) as connection:
-        stored = _identity(connection)
-        return stored["embedder"], int(stored["dimension"])
+        return _identity(connection)
 
 
 def check_sessions(path: Path, numbers: Collection[int]) -> None:
@@ -309,20 +309,21 @@ def _open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
         yield connection
 
 
-def _identity(connection: sqlite3.Connection) -> dict[str, Any]:
-    """Return the embedder and dimension of a file, as text; raise a `ValueError` if they cannot be read."""
-    about = connection.execute("SELECT content FROM about").fetchone()
-    stored = json.loads(about[0]) if about else {}
-    if not isinstance(stored, dict) or not all(isinstance(value, str) for value in stored.values()):
+def _identity(connection: sqlite3.Connection) -> tuple[str, int]:
+    """Return the embedder and dimension of a file; raise a `ValueError` if they cannot be read."""
+    stored = json.loads(connection.execute("SELECT content FROM about").fetchone()[0])
+    if not isinstance(stored["embedder"], str):
         raise ValueError("its embedder cannot be read")
-    return stored
+    return stored["embedder"], int(stored["dimension"])
 
 
-def _check_identity(connection: sqlite3.Connection, name: str, identity: dict[str, str]) -> None:
+def _check_identity(connection: sqlite3.Connection, name: str, identity: tuple[str, int]) -> None:
     """Raise an `UmfError` if the file `name` has another embedder."""
-    stored = _identity(connection)
-    wrong = [f"{key} {stored.get(key)}, not {value}" for key, value in identity.items() if stored.get(key) != value]
-    if stored and wrong:
+    if not connection.execute("SELECT 1 FROM about").fetchone():  # its process was killed before it wrote them
+        return
+    both = zip(("embedder", "dimension"), _identity(connection), identity, strict=True)
+    wrong = [f"{key} {stored}, not {value}" for key, stored, value in both if stored != value]
+    if wrong:
         raise UmfError(f"{name} was made with {'; '.join(wrong)}")
 
 

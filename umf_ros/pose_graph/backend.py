@@ -18,8 +18,10 @@ from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError, writing
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, gtsam_to_ros_covariance, invert
+from umf_ros.core.io import write_table
 from umf_ros.core.trajectory import Trajectory, write_g2o, write_geojson, write_tum
 from umf_ros.pose_graph.closures import (
+    VERDICT_COLUMNS,
     ClosureReason,
     ClosureVerdict,
     Decision,
@@ -28,7 +30,7 @@ from umf_ros.pose_graph.closures import (
     check_closure,
     check_covariance,
     check_pose,
-    verdict_table,
+    verdict_rows,
 )
 from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.odometry import POINT, PathPoints, Stamps
@@ -147,13 +149,12 @@ class PoseGraph:
         """Do part of the work of `settle` within a time limit; after a long mission it takes minutes."""
         self._refresh()
         last_ns = [chain.stamps[-1:] for chain in self._sessions.chains]
-        self._reprocess(
-            within_s,
-            lambda one: (
-                all(last_ns[one.match] > one.closure.match_stamp_ns)
-                and all(last_ns[one.query] > one.closure.query_stamp_ns)
-            ),
-        )
+
+        def has_odometry_beyond(one: PlacedClosure) -> bool:
+            ends = (one.match, one.closure.match_stamp_ns), (one.query, one.closure.query_stamp_ns)
+            return all((last_ns[session] > stamp_ns).all() for session, stamp_ns in ends)
+
+        self._reprocess(within_s, has_odometry_beyond)
 
     def settle(self, within_s: float = float("inf")) -> list[ClosureVerdict] | None:
         """Decide finally and solve for the exact optimum, as at the end of a mission.
@@ -382,9 +383,8 @@ class PoseGraph:
         """
         full = self.graph()
         write_g2o(path, full.poses, full.edges)
-        lines = (f"{row},{session},{stamp}\n" for row, (session, stamp) in enumerate(full.vertices))
-        with writing(table := path.with_suffix(".csv")):
-            table.write_text("".join(("id,session,stamp_ns\n", *lines)), encoding="ascii")
+        rows = ((row, *vertex) for row, vertex in enumerate(full.vertices))
+        write_table(path.with_suffix(".csv"), ("id", "session", "stamp_ns"), rows)
 
     def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
         """Settle, and write trajectories (TUM), the graph (g2o and id-stamp table) and all verdicts (CSV).
@@ -397,7 +397,7 @@ class PoseGraph:
         settled = self.settle(within_s) is not None
         with writing(f"to {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / "graph_verdicts.csv").write_text(verdict_table(self.closures()), encoding="utf-8")
+        write_table(folder / "graph_verdicts.csv", VERDICT_COLUMNS, verdict_rows(self.closures()))
         if absolute := self.reference.verdicts():
             write_verdicts(folder / "absolute_verdicts.csv", absolute)
         if (world := self.world()) is not None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -90,15 +88,10 @@ class PlacedClosure(NamedTuple):
     closure: LoopClosure
 
 
-def verdict_table(verdicts: Iterable[ClosureVerdict]) -> str:
-    """All verdicts as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(VERDICT_COLUMNS)
-    for verdict in verdicts:
-        numbers = (f"{verdict.residual:.3f}", f"{verdict.residual_m:.3f}")
-        writer.writerow([*verdict.closure.pair, verdict.state.value, verdict.reason, *numbers])
-    return text.getvalue()
+def verdict_rows(verdicts: Iterable[ClosureVerdict]) -> list[list[object]]:
+    """Return the rows of a table of verdicts."""
+    numbers = ((one, f"{one.residual:.3f}", f"{one.residual_m:.3f}") for one in verdicts)
+    return [[*one.closure.pair, one.state.value, one.reason, *residuals] for one, *residuals in numbers]
 
 
 Closures = NDArray[np.void]

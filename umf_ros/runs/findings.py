@@ -359,17 +359,13 @@ class RunVerdict:
 def conclude(about: JudgedRun, findings: list[Advice]) -> RunVerdict:
     """Return the verdict: green only with a closure found, or without any revisit."""
     sentence = ", ".join(filter(None, (_found(about), _used(about)))) + _errors(about) + "."
-    warnings = [finding for finding in findings if finding.severity != "note"]
+    closed, warnings = bool(about.run.closures), [finding for finding in findings if finding.severity != "note"]
+    first = f"{_capital(warnings[0].what)}. " if warnings else ""
     if any(finding.severity == "fault" for finding in warnings):
-        return RunVerdict(f"{_capital(warnings[0].what)}. {sentence}", "bad", 0 if about.run.closures else USELESS)
-    if about.run.closures and not warnings:
-        return RunVerdict(sentence, "good")
-    nothing_to_find = about.covered[0] and not about.revisits
-    if not about.run.closures and nothing_to_find:
-        return RunVerdict(f"No place was revisited. {sentence}", "good" if not warnings else "warn")
-    if warnings:
-        return RunVerdict(f"{_capital(warnings[0].what)}. {sentence}", "warn")
-    return RunVerdict(sentence, "warn")
+        return RunVerdict(first + sentence, "bad", 0 if closed else USELESS)
+    if not closed and about.covered[0] and not about.revisits:
+        return RunVerdict(f"No place was revisited. {sentence}", "warn" if warnings else "good")
+    return RunVerdict(first + sentence, "good" if closed and not warnings else "warn")
 
 
 def _found(about: JudgedRun) -> str:

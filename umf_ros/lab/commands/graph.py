@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.core.errors import ConfigError, writing
+from umf_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -39,7 +39,7 @@ def optimize(
     from rich.progress import track
 
     from umf_ros.core.config import PoseGraphSettings
-    from umf_ros.lab.datasets.g2o import as_recording, drive, read_g2o, verdicts_by_vertex, write_optimised
+    from umf_ros.lab.datasets.g2o import as_recording, drive, read_g2o, write_optimised, write_verdicts_by_vertex
     from umf_ros.pose_graph.backend import PoseGraph
 
     console, content = Console(), read_g2o(file)
@@ -56,8 +56,7 @@ def optimize(
         write_optimised(output, graph, recording, content.planar)
         console.print(f"optimised graph: {output}")
     if verdicts is not None:
-        with writing(verdicts):
-            verdicts.write_text(verdicts_by_vertex(graph, recording), encoding="utf-8")
+        write_verdicts_by_vertex(verdicts, graph, recording)
 
 
 @app.command()

@@ -30,9 +30,10 @@ from umf_ros.core.geometry import (
     make_pose,
     propagate,
 )
+from umf_ros.core.io import write_table
 from umf_ros.core.trajectory import EDGE, g2o_lines, write_g2o
 from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.pose_graph.closures import check_covariance, verdict_table
+from umf_ros.pose_graph.closures import VERDICT_COLUMNS, check_covariance, verdict_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -259,13 +260,13 @@ def write_optimised(path: Path, graph: PoseGraph, recording: GraphRecording, pla
     write(path, full.poses, full.edges, ids)
 
 
-def verdicts_by_vertex(graph: PoseGraph, recording: GraphRecording) -> str:
-    """All verdicts as CSV, with vertex ids in place of stamps."""
+def write_verdicts_by_vertex(path: Path, graph: PoseGraph, recording: GraphRecording) -> None:
+    """Write all verdicts as CSV, with vertex ids in place of stamps."""
     verdicts = []
     for verdict in graph.closures():
         match, query = map(recording.vertex_of, (verdict.closure.match_stamp_ns, verdict.closure.query_stamp_ns))
         verdicts.append(replace(verdict, closure=replace(verdict.closure, match_stamp_ns=match, query_stamp_ns=query)))
-    return verdict_table(verdicts).replace("match_stamp_ns,query_stamp_ns", "match,query", 1)
+    write_table(path, ("match", "query", *VERDICT_COLUMNS[2:]), verdict_rows(verdicts))
 
 
 def drive(graph: PoseGraph, recording: GraphRecording) -> Iterator[int]:
