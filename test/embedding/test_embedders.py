@@ -43,7 +43,7 @@ def weights(tmp_path_factory):
 
 @pytest.fixture
 def embedder(weights):
-    return UmfEmbedder(weights, EmbeddingSettings(runtime="torch", threads=1), FeatureRequest(supers=True))
+    return UmfEmbedder(EmbeddingSettings(weights=str(weights), runtime="torch", threads=1), FeatureRequest(supers=True))
 
 
 def test_what_comes_out(embedder):
@@ -102,8 +102,8 @@ def test_positions_belong_to_the_image_given(embedder, shape):
 
 def test_the_shipped_model_agrees_with_its_weights():
     """Eight bits change a descriptor by less than views of neighbouring places differ."""
-    plain = UmfEmbedder(None, EmbeddingSettings(runtime="torch", threads=1), FeatureRequest(supers=True))
-    fast = UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), FeatureRequest(supers=True))
+    plain = UmfEmbedder(EmbeddingSettings(runtime="torch", threads=1), FeatureRequest(supers=True))
+    fast = UmfEmbedder(EmbeddingSettings(runtime="openvino", threads=1), FeatureRequest(supers=True))
     assert plain.name.startswith("umf_scene-") and fast.name.startswith("umf_scene-int8-")
     for frame in (some_frame(), some_frame(1, left=None), some_frame(2, points=None, intensity=None)):
         wanted, found = plain.embed(frame), fast.embed(frame)
@@ -114,8 +114,7 @@ def test_the_shipped_model_agrees_with_its_weights():
 
 def test_what_is_not_asked_for_is_left_out_and_changes_nothing_else():
     whole, bare = (
-        UmfEmbedder(None, EmbeddingSettings(runtime="openvino", threads=1), FeatureRequest(image))
-        for image in (True, False)
+        UmfEmbedder(EmbeddingSettings(runtime="openvino", threads=1), FeatureRequest(image)) for image in (True, False)
     )
     one, other = whole.embed(some_frame()), bare.embed(some_frame())
     assert one.image is not None and other.image is None and one.cloud is not None and other.cloud is not None
@@ -219,7 +218,8 @@ def test_the_name_tells_weights_apart(weights, tmp_path):
     torch.manual_seed(1)
     save_weights(UMF(TINY), other, {})
     names = [
-        UmfEmbedder(path, EmbeddingSettings(runtime="torch", threads=1)).name for path in (weights, other, weights)
+        UmfEmbedder(EmbeddingSettings(weights=str(path), runtime="torch", threads=1)).name
+        for path in (weights, other, weights)
     ]
     assert names[0] == names[2] != names[1]
     assert all(name.startswith("tiny-") for name in names)
@@ -317,7 +317,7 @@ def test_the_untrained_trunk_needs_its_published_weights_and_sees_the_image_alon
 
 def test_the_mount_of_the_lidar_changes_neither_descriptor_nor_where_features_lie(weights):
     """The tilt of a mount is undone before the network reads a scan."""
-    embedder = UmfEmbedder(weights, EmbeddingSettings(runtime="torch", threads=1))
+    embedder = UmfEmbedder(EmbeddingSettings(weights=str(weights), runtime="torch", threads=1))
     x, y = np.random.default_rng(3).uniform([[1.0], [-18.0]], [[38.0], [18.0]], (2, 20_000))
     rocks = 1.5 * (np.sin(2 * x) * np.cos(1.5 * y) > 0.9)
     points = np.column_stack([x, y, rocks]).astype(np.float32)

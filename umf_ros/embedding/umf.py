@@ -66,8 +66,7 @@ class UmfEmbedder:
     means of the points of a voxel.
 
     Args:
-        weights: safetensors file, name of shipped weights, or None for the default.
-        settings: runtime, device and threads.
+        settings: weights (a safetensors file, or the shipped ones), runtime, device and threads.
         asked: local features to compute.
 
     Raises:
@@ -77,17 +76,16 @@ class UmfEmbedder:
 
     def __init__(
         self,
-        weights: Path | None = None,
-        settings: EmbeddingSettings | None = None,
+        settings: EmbeddingSettings,
         asked: FeatureRequest = FeatureRequest(),  # noqa: B008 (a tuple)
     ) -> None:
-        path = locate_weights(weights)
+        path = locate_weights(Path(settings.weights) if settings.weights else None)
         self._config = read_config(path)
         self.dimension = self._config.length
         self._asked = asked
         rows, columns = (side // 4 for side in self._config.image_size)
         self._regions = cell_regions(rows, columns)
-        self._runtime = make_runtime(path, settings or EmbeddingSettings(), outputs_of(asked))
+        self._runtime = make_runtime(path, settings, outputs_of(asked))
         self.name = name_outputs(path, self._runtime, PREPROCESSING)
 
     def embed(self, frame: Frame) -> Embedding:
@@ -126,9 +124,7 @@ class UmfEmbedder:
         return image, SuperFeatures(found["super_cloud"].astype(np.float16), found["super_cloud_strength"])
 
 
-def make(settings: EmbeddingSettings, asked: FeatureRequest) -> UmfEmbedder:
-    """Return the embedder with the weights that the settings name."""
-    return UmfEmbedder(Path(settings.weights) if settings.weights else None, settings, asked)
+make = UmfEmbedder
 
 
 def _features(

@@ -57,7 +57,7 @@ def test_attention_and_key_points_are_drawn(tmp_path: Path, rng: np.random.Gener
     weights = tmp_path / "tiny.safetensors"
     save_weights(UMF(TINY).eval(), weights, {})
     embedder, network = (
-        UmfEmbedder(weights, EmbeddingSettings(runtime="torch"), FeatureRequest(supers=True)),
+        UmfEmbedder(EmbeddingSettings(weights=str(weights), runtime="torch"), FeatureRequest(supers=True)),
         load_weights(weights),
     )
     from conftest import CAMERA

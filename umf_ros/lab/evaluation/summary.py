@@ -188,8 +188,8 @@ def measure(embedder: Embedder, frames: Sequence[Frame], repeats: int) -> float:
 def cost_of_weights(weights: Path, frames: Sequence[Frame], repeats: int) -> Cost:
     """Cost of a weights file, or of shipped weights by name."""
     path = locate_weights(weights)
-    eager = measure(UmfEmbedder(path, EmbeddingSettings(runtime="torch")), frames, repeats)
-    fast = measure(UmfEmbedder(path), frames, repeats)
+    eager = measure(UmfEmbedder(EmbeddingSettings(weights=str(path), runtime="torch")), frames, repeats)
+    fast = measure(UmfEmbedder(EmbeddingSettings(weights=str(path))), frames, repeats)
     return Cost(path.stem, count_parameters(load_weights(path)), eager, fast)
 
 
