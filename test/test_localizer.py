@@ -5,10 +5,11 @@ import pytest
 from maps_made import COVARIANCE, START_NS, on_circle
 
 from umf_ros.core.config import PoseGraphSettings
-from umf_ros.core.frames import LoopClosure
+from umf_ros.core.frames import LoopClosure, State
 from umf_ros.core.geometry import Array, expmap, invert, make_pose, relative, rotation_angle
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.localizer import ACCEPTED_ODDS, Localizer
+from umf_ros.pose_graph.closures import ClosureReason
 
 SECOND_NS = 10**9
 LATER_NS = START_NS + 5000 * SECOND_NS
@@ -60,10 +61,12 @@ class Drive:
 
 def test_a_cold_start_is_localised_within_some_metres_of_closures() -> None:
     rover = Drive(37)
-    assert rover.localizer.add_closure(rover.closure()) is None  # one alone is not believed
-    told = [rover.drive(1).localizer.add_closure(rover.closure()) for _ in range(6)]
-    first = next(row for row, one in enumerate(told) if one is not None)
-    assert 1 <= first <= 4
+    known = []
+    for _ in range(7):
+        rover.localizer.add_closure(rover.closure())
+        known.append(rover.localizer.estimate() is not None)
+        rover.drive(1)
+    assert not any(known[:2]) and all(known[5:])  # one alone is not believed
     found = rover.localizer.estimate()
     assert found is not None and found.probability > 0.999
     assert rover.error_m() < 0.1
@@ -93,7 +96,7 @@ def test_a_single_wrong_closure_does_not_move_the_pose() -> None:
     for row in range(12):
         rover.drive(1).localizer.add_closure(rover.closure(at_m=80 if row == 8 else None))
     assert rover.error_m() < 0.15 and rover.localizer.relocalised == 1
-    assert rover.localizer.counts["contradicted"] == 1
+    assert rover.localizer.reasons[ClosureReason.CONTRADICTS_POSE] == 1
 
 
 def test_a_moved_rover_is_relocalised() -> None:
@@ -146,17 +149,19 @@ def test_a_closure_before_its_odometry_is_pending() -> None:
     rover = Drive(50)
     for _ in range(6):
         rover.drive(1).localizer.add_closure(rover.closure())
-    known = rover.localizer.counts["agreed"]
+    known = rover.localizer.reasons[ClosureReason.AGREES_WITH_POSE]
     early = rover.closure()
     ahead = LoopClosure(
         early.query_stamp_ns + 10**8,
         *(getattr(early, n) for n in ("match_stamp_ns", "match_T_query", "covariance")),
         0.99,
     )
-    assert rover.localizer.add_closure(ahead) is None
-    assert rover.localizer.counts["agreed"] == known
+    pending = rover.localizer.verdict_counts()[State.PENDING]
+    (verdict,) = rover.localizer.add_closure(ahead)
+    assert verdict.state is State.PENDING and rover.localizer.verdict_counts()[State.PENDING] == pending + 1
+    assert rover.localizer.reasons[ClosureReason.AGREES_WITH_POSE] == known
     rover.drive(0.25)
-    assert rover.localizer.counts["agreed"] == known + 1
+    assert rover.localizer.reasons[ClosureReason.AGREES_WITH_POSE] == known + 1
 
 
 @pytest.mark.parametrize("kind", ["unknown match", "before all odometry", "broken pose"])
@@ -169,8 +174,9 @@ def test_unusable_closures_are_counted(kind: str) -> None:
         "before all odometry": (match, LATER_NS - SECOND_NS, pose),
         "broken pose": (match, stamp, 2 * pose),
     }[kind]
-    assert rover.localizer.add_closure(LoopClosure(stamp, match, pose, COVARIANCE, 0.99)) is None
-    assert rover.localizer.counts["unusable"] == 1
+    (verdict,) = rover.localizer.add_closure(LoopClosure(stamp, match, pose, COVARIANCE, 0.99))
+    assert verdict.state is State.REFUSED
+    assert rover.localizer.reasons[ClosureReason.NOT_OF_MAP] == 1
 
 
 def test_invalid_odometry_is_refused() -> None:

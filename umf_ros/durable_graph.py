@@ -148,7 +148,7 @@ class DurableGraph:
         counts: dict[str, object] = {**self.graph.counts, **self.graph.reference.report()}
         counts |= {"odometry_out_of_line": self.feed.dropped, "odometry_held": self.feed.held}
         counts |= {state.value: count for state, count in self.graph.verdict_counts().items()}
-        probability = getattr(self.graph, "probability", None)  # of a `MapFollower`
+        probability = getattr(self.graph, "probability", None)  # of a `Localizer`
         pose = self.graph.map_T_odom(), self.graph.covariance()
         return GraphState(*pose, self.feed.newest_ns, counts, self.unsettled, probability)
 

@@ -114,9 +114,9 @@ def serve() -> None:
 
     def open_graph(settings: Settings, journal: Path | None) -> DurableGraph:
         from umf_ros.durable_graph import DurableGraph
-        from umf_ros.localizer import MapFollower
+        from umf_ros.localizer import open_localizer
 
-        make = partial(MapFollower, settings) if settings.localizing else None
+        make = partial(open_localizer, settings) if settings.localizing else None
         return DurableGraph(settings.pose_graph, journal, faults.append, make)
 
     graph: DurableGraph | None = None

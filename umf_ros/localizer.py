@@ -90,35 +90,38 @@ class _PoseHypothesis:
     counted_m: float
 
 
-class Localizer:
-    """Localisation in a fixed map by pose hypotheses from closures and odometry.
+class Localizer(PoseGraph):
+    """Localisation in a fixed map by pose hypotheses from closures and odometry, with the interface of a pose graph.
 
     A closure that agrees with no hypothesis adds one. Later closures agree with a hypothesis or contradict it, within
     the covariances of closure and odometry, and change its odds by the path length between them. The pose is that of
-    the accepted hypothesis until another one is accepted, so a kidnapped rover is relocalised.
+    the accepted hypothesis until another one is accepted, so a kidnapped rover is relocalised. Closures are counted and
+    not kept.
 
     `poses` are those of the map's keyframes, by the stamps that closures name as their match.
 
     Attributes:
         relocalised: number of times that a hypothesis was accepted.
-        counts: closures that agreed with the pose, contradicted it, came before there was one, or were unusable.
+        reasons: number of closures by the reason of their verdict, those without odometry left out.
     """
 
     def __init__(self, poses: Trajectory, settings: PoseGraphSettings) -> None:
+        super().__init__(settings)
         self._map = dict(zip(poses.stamps_ns.tolist(), poses.poses, strict=True))
-        self._settings, self._noise = settings, OdometryNoise.stated(settings)
+        self._noise = OdometryNoise.stated(settings)
+        self._path: list[Localization] = []
         self.relocalised = 0
-        self.counts = {"agreed": 0, "contradicted": 0, "searching": 0, "unusable": 0}
+        self.reasons: Counter[ClosureReason] = Counter()
         self.begin_session()
 
     def begin_session(self) -> None:
         """Delete all hypotheses: the odometry restarts at any place."""
         self._samples: deque[_Sample] = deque(maxlen=_KEPT_MESSAGES)
-        self._pending: deque[LoopClosure] = deque(maxlen=50)
+        self._early: deque[LoopClosure] = deque(maxlen=50)
         self._hypotheses: list[_PoseHypothesis] = []
         self._accepted: _PoseHypothesis | None = None
 
-    def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> bool:
+    def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
         """Add an odometry message; return whether it was usable."""
         try:
             check_pose(odom_T_body)
@@ -132,25 +135,27 @@ class Localizer:
             # a stationary rover gathers no evidence
             path_m = last.path_m + float(self._noise.path_lengths(last.pose[None], odom_T_body[None], np.zeros(1))[0])
         self._samples.append(_Sample(stamp_ns, np.asarray(odom_T_body, float), path_m))
-        for _ in range(len(self._pending)):
-            self.add_closure(self._pending.popleft())
+        for _ in range(len(self._early)):
+            self.add_closure(self._early.popleft())
+        found = self.estimate()
+        if found is not None:
+            before = self._path[-1].map_T_body[:3, 3] if self._path else np.full(3, np.inf)
+            if np.linalg.norm(found.map_T_body[:3, 3] - before) >= _SPACING_M:
+                self._path.append(found)
         return True
 
-    def add_closure(self, closure: LoopClosure) -> Localization | None:
-        """Add a closure with a keyframe of the map; return the pose at the query, None while it is unknown."""
+    def add_absolute(self, measurement: AbsoluteMeasurement) -> None:
+        """Count a measurement; the map stays unchanged."""
+        self.counts["absolute measurements unused"] += 1
+
+    def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
+        """Add a closure with a keyframe of the map; return its verdict."""
         if self._samples and closure.query_stamp_ns > self._samples[-1].stamp_ns:
-            self._pending.append(closure)
-            return None
-        at, match = self._sample(closure.query_stamp_ns), self._map.get(closure.match_stamp_ns)
-        try:
-            covariance = check_closure(closure, self._settings.max_closure_m)
-        except GraphError:
-            at = None
-        if at is None or match is None:
-            self.counts["unusable"] += 1
-            return None
-        self._update(at, match @ closure.match_T_query, covariance + np.diag(_MAP_SIGMAS**2), closure.probability)
-        return None if self._accepted is None else self._localization(self._accepted, at)
+            self._early.append(closure)
+            return [ClosureVerdict(closure, State.PENDING, ClosureReason.NO_ODOMETRY_YET)]
+        reason = self._judge(closure)
+        self.reasons[reason] += 1
+        return [ClosureVerdict(closure, _STATES[reason], reason)]
 
     def estimate(self) -> Localization | None:
         """Return the pose at the newest odometry; None while it is unknown."""
@@ -158,14 +163,56 @@ class Localizer:
             return None
         return self._localization(self._accepted, self._samples[-1])
 
+    @property
+    def probability(self) -> float:
+        """Probability of the pose; 0 while it is unknown."""
+        found = self.estimate()
+        return 0.0 if found is None else found.probability
+
     def map_T_odom(self) -> Array | None:
         """Return (4, 4) pose of the odometry's frame in the map; None while it is unknown."""
         known = self._accepted
         return None if known is None else known.pose @ invert(known.at.pose)
 
-    def _update(self, at: _Sample, pose: Array, covariance: Array, probability: float) -> None:
-        """Compare a measured pose with every hypothesis, and add one if none agrees."""
-        gain = trust = min(_logit(probability), _MOST_PER_CLOSURE)
+    def covariance(self) -> Array:
+        """Return (6, 6) of the newest pose in ROS order; zero while it is unknown."""
+        found = self.estimate()
+        return np.zeros((6, 6)) if found is None else found.covariance
+
+    def trajectory(self, optimized: bool = True) -> tuple[NDArray[np.int64], Array]:
+        """Return stamps (N,) in ns and `map_T_body` (N, 4, 4) since the rover was localised, 0.25 m apart."""
+        stamps = np.array([one.stamp_ns for one in self._path], np.int64)
+        return stamps, np.array([one.map_T_body for one in self._path]).reshape(-1, 4, 4)
+
+    def verdict_counts(self) -> Counter[State]:
+        """Return the number of closures by state."""
+        counts = Counter({State.PENDING: len(self._early)} if self._early else {})
+        for reason, count in self.reasons.items():
+            counts[_STATES[reason]] += count
+        return counts
+
+    def decide_by_hand(self, match_stamp_ns: int, query_stamp_ns: int, state: State) -> list[ClosureVerdict]:
+        """Raise a `GraphError`: there is nothing to decide about."""
+        raise GraphError("localisation in a fixed map keeps no closures to decide about")
+
+    def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
+        """Write the trajectory, `trajectory_in_map.tum`; return true, as there is nothing to settle."""
+        with writing(f"to {folder}"):
+            folder.mkdir(parents=True, exist_ok=True)
+        write_tum(folder / "trajectory_in_map.tum", Trajectory(*self.trajectory()))
+        return True
+
+    def _judge(self, closure: LoopClosure) -> ClosureReason:
+        """Compare the pose by a closure with every hypothesis, and add one if none agrees."""
+        at, match = self._sample(closure.query_stamp_ns), self._map.get(closure.match_stamp_ns)
+        try:
+            covariance = check_closure(closure, self._settings.max_closure_m) + np.diag(_MAP_SIGMAS**2)
+        except GraphError:
+            at = None
+        if at is None or match is None:
+            return ClosureReason.NOT_OF_MAP
+        pose = match @ closure.match_T_query
+        gain = trust = min(_logit(closure.probability), _MOST_PER_CLOSURE)
         agreed = [one for one in self._hypotheses if self._correct(one, at, pose, covariance)]
         for one in agreed:
             gain = min(gain, _NATS_PER_M * max(at.path_m - one.counted_m, 0.0))
@@ -174,9 +221,11 @@ class Localizer:
             one.odds = min(one.odds + (gain if one in agreed else -gain), _MOST_ODDS)
         if not agreed:
             self._hypotheses.append(_PoseHypothesis(at, pose, covariance, trust, at.path_m))
-        known = "agreed" if self._accepted in agreed else "contradicted"
-        self.counts["searching" if self._accepted is None else known] += 1
+        reason = ClosureReason.AGREES_WITH_POSE if self._accepted in agreed else ClosureReason.CONTRADICTS_POSE
+        if self._accepted is None:
+            reason = ClosureReason.POSE_UNKNOWN
         self._choose()
+        return reason
 
     def _choose(self) -> None:
         """Keep the likeliest hypotheses, one per pose, and accept the best if its odds suffice."""
@@ -248,85 +297,14 @@ def read_poses(path: Path) -> Trajectory:
         raise UmfError(f"{path / POSES} cannot be read: run umf map to solve the map") from None
 
 
+def open_localizer(settings: Settings) -> Localizer:
+    """Return a localizer in the map of the settings; raise an `UmfError` if it has not been solved."""
+    return Localizer(read_poses(Path(settings.map)), settings.pose_graph)
+
+
 _STATES = {
-    "agreed": (State.ACCEPTED, ClosureReason.AGREES_WITH_POSE),
-    "contradicted": (State.REJECTED, ClosureReason.CONTRADICTS_POSE),
-    "searching": (State.PENDING, ClosureReason.POSE_UNKNOWN),
-    "unusable": (State.REFUSED, ClosureReason.NOT_OF_MAP),
+    ClosureReason.AGREES_WITH_POSE: State.ACCEPTED,
+    ClosureReason.CONTRADICTS_POSE: State.REJECTED,
+    ClosureReason.POSE_UNKNOWN: State.PENDING,
+    ClosureReason.NOT_OF_MAP: State.REFUSED,
 }
-"""State of a closure by the localizer's count."""
-
-
-class MapFollower(PoseGraph):
-    """Localisation in a map with the interface of a pose graph; closures are counted by state and not kept.
-
-    Attributes:
-        localizer: the hypotheses of the pose.
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        super().__init__(settings.pose_graph)
-        self.localizer = Localizer(read_poses(Path(settings.map)), settings.pose_graph)
-        self._poses: list[Localization] = []
-        self._states: Counter[State] = Counter()
-
-    @property
-    def probability(self) -> float:
-        """Probability of the pose; 0 while it is unknown."""
-        found = self.localizer.estimate()
-        return 0.0 if found is None else found.probability
-
-    def begin_session(self) -> None:
-        """Delete the pose: the rover may be anywhere."""
-        self.localizer.begin_session()
-
-    def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
-        """Add an odometry message; return whether it was usable."""
-        usable, found = self.localizer.add_odometry(stamp_ns, odom_T_body), self.localizer.estimate()
-        if found is not None:
-            last = self._poses[-1].map_T_body[:3, 3] if self._poses else np.full(3, np.inf)
-            if np.linalg.norm(found.map_T_body[:3, 3] - last) >= _SPACING_M:
-                self._poses.append(found)
-        return usable
-
-    def add_absolute(self, measurement: AbsoluteMeasurement) -> None:
-        """Count a measurement; the map stays unchanged."""
-        self.counts["absolute measurements unused"] += 1
-
-    def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
-        """Add a closure with the map; return its verdict."""
-        before = Counter(self.localizer.counts)
-        self.localizer.add_closure(closure)
-        change = Counter(self.localizer.counts) - before
-        state, reason = _STATES.get(next(iter(change), ""), (State.PENDING, ClosureReason.NO_ODOMETRY_YET))
-        self._states[state] += 1
-        return [ClosureVerdict(closure, state, reason)]
-
-    def map_T_odom(self) -> Array | None:
-        """Return (4, 4) pose of the odometry frame in the map; None while it is unknown."""
-        return self.localizer.map_T_odom()
-
-    def covariance(self) -> Array:
-        """Return (6, 6) of the newest pose in ROS order; zero while it is unknown."""
-        found = self.localizer.estimate()
-        return np.zeros((6, 6)) if found is None else found.covariance
-
-    def trajectory(self, optimized: bool = True) -> tuple[NDArray[np.int64], Array]:
-        """Return stamps (N,) in ns and `map_T_body` (N, 4, 4) since the rover was localised, 0.25 m apart."""
-        stamps = np.array([one.stamp_ns for one in self._poses], np.int64)
-        return stamps, np.array([one.map_T_body for one in self._poses]).reshape(-1, 4, 4)
-
-    def verdict_counts(self) -> Counter[State]:
-        """Return the number of closures by state."""
-        return Counter(self._states)
-
-    def decide_by_hand(self, match_stamp_ns: int, query_stamp_ns: int, state: State) -> list[ClosureVerdict]:
-        """Raise a `GraphError`: there is nothing to decide about."""
-        raise GraphError("localisation in a fixed map keeps no closures to decide about")
-
-    def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
-        """Write the trajectory, `trajectory_in_map.tum`; return true, as there is nothing to settle."""
-        with writing(f"to {folder}"):
-            folder.mkdir(parents=True, exist_ok=True)
-        write_tum(folder / "trajectory_in_map.tum", Trajectory(*self.trajectory()))
-        return True

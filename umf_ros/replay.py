@@ -15,8 +15,9 @@ from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
 from umf_ros.detector import Detection, LoopDetector
-from umf_ros.localizer import Localization, Localizer, MapFollower
+from umf_ros.localizer import Localization, Localizer, open_localizer
 from umf_ros.pose_graph.backend import PoseGraph
+from umf_ros.pose_graph.closures import ClosureReason
 from umf_ros.runs.writer import RunRecorder, write_summary
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
@@ -34,7 +35,7 @@ class Replay:
     """Replay: feeds frames to the detector, odometry and closures to the pose graph, and writes a run folder.
 
     The graph gets the inputs of the live back-end: every odometry message, and one closure after the other. With
-    settings of mode localization, a `MapFollower` takes the place of the graph, as live.
+    settings of mode localization, a `Localizer` takes the place of the graph, as live.
 
     Args:
         folder: run folder.
@@ -56,8 +57,8 @@ class Replay:
     def __init__(self, folder: Path, settings: Settings, detector: LoopDetector, resume: bool = False) -> None:
         self._folder = folder
         self._detector = detector
-        self._graph = MapFollower(settings) if settings.localizing else PoseGraph(settings.pose_graph)
-        self._localizer = self._graph.localizer if isinstance(self._graph, MapFollower) else None
+        self._localizer = open_localizer(settings) if settings.localizing else None
+        self._graph = self._localizer or PoseGraph(settings.pose_graph)
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometrySessionSplitter(self._graph)
         self.sensor_check = SensorCheck()
@@ -163,7 +164,8 @@ class Replay:
         counts, found = self.counts, localizer.estimate()
         counts["keyframes"] += 1
         counts["relocalised"] = localizer.relocalised
-        counts |= {name: localizer.counts[name] for name in ("agreed", "contradicted")}
+        counts["agreed"] = localizer.reasons[ClosureReason.AGREES_WITH_POSE]
+        counts["contradicted"] = localizer.reasons[ClosureReason.CONTRADICTS_POSE]
         if found is None:
             return
         counts["located"] += 1

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
@@ -54,7 +55,7 @@ from umf_ros.sensors.sessions import OdometrySessionSplitter
 WITHIN_KEYFRAMES = 20
 WRONG_M, WRONG_DEG = 1.0, 5.0
 OVERLAP_M = 20.0
-Stream = list[Frame | OdometrySample]
+Stream = list[Frame | OdometrySample | AbsoluteMeasurement]
 
 
 @dataclass(frozen=True)

@@ -42,12 +42,12 @@ def with_topics(tmp_path: Path, **topics: str) -> Settings:
 def test_a_recording_gives_fixes_and_gravity_where_they_are_named(tmp_path: Path) -> None:
     bag, told = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), list[str]()
     reader = FrameReader(bag, with_topics(tmp_path, gnss="/gnss/fix", imu="/imu/data"), warn=told.append)
-    found = [item for item in reader.graph_stream() if isinstance(item, AbsoluteMeasurement)]
+    found = [item for item in reader.stream() if isinstance(item, AbsoluteMeasurement)]
     assert [one.stamp_ns for one in found if one.source is Aid.GNSS] == [START_NS + k * 500_000_000 for k in range(6)]
     up = [one.value for one in found if one.source is Aid.GRAVITY]
     assert 2 <= len(up) <= 3 and np.allclose(np.linalg.norm(up, axis=1), 1) and not told
     off = FrameReader(bag, small_settings(tmp_path))
-    assert not any(isinstance(item, AbsoluteMeasurement) for item in off.graph_stream())
+    assert not any(isinstance(item, AbsoluteMeasurement) for item in off.stream())
 
 
 def test_a_receiver_without_a_fix_is_told_once(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_a_receiver_without_a_fix_is_told_once(tmp_path: Path) -> None:
         message.status.status = -1
     entries = [*traverse(1.0), *(("/gnss/fix", START_NS + k, message) for k, message in enumerate(lost))]
     bag, told = open_bag(write_mcap(tmp_path / "a.mcap", entries)), list[str]()
-    list(FrameReader(bag, with_topics(tmp_path, gnss="/gnss/fix"), warn=told.append).graph_stream())
+    list(FrameReader(bag, with_topics(tmp_path, gnss="/gnss/fix"), warn=told.append).stream())
     assert told == ["/gnss/fix: the GNSS receiver has no fix; such messages are skipped"]
 
 
@@ -67,20 +67,8 @@ def test_a_message_that_breaks_the_decoder_costs_itself_alone(tmp_path: Path, mo
     monkeypatch.setattr("umf_ros.absolute.measurement.decode_fix", broken)
     bag, told = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), list[str]()
     reader = FrameReader(bag, with_topics(tmp_path, gnss="/gnss/fix"), warn=told.append)
-    assert any(isinstance(item, Frame) for item in reader.graph_stream())
+    assert any(isinstance(item, Frame) for item in reader.stream())
     assert told == ["/gnss/fix: message raises ZeroDivisionError: of a message; such messages are skipped"]
-
-
-def test_a_stream_without_a_graph_decodes_no_absolute_measurement(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def unwanted(*_: object) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr("umf_ros.absolute.measurement.AbsoluteDecoder.decode", unwanted)
-    bag, told = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), list[str]()
-    items = list(FrameReader(bag, with_topics(tmp_path, gnss="/gnss/fix"), warn=told.append).stream())
-    assert any(isinstance(item, Frame) for item in items) and not told
 
 
 def test_a_topic_that_is_not_there_is_one_line_with_the_others(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ class FrameReader:
         self.progress = 0.0
         self._bag, self._odometry, self._rows_taken = bag, odometry, 0
         self._synchronizer = Synchronizer(settings.sync, calibration, inputs, warn)
-        self._samples: list[OdometrySample] = []
+        self._samples: list[OdometrySample | AbsoluteMeasurement] = []
         self._truth: list[RawMessage] = []
         transforms = read_transforms(bag) if settings.uses_transforms else StaticTransforms()
         known = transforms.version or calibration.is_open
@@ -80,46 +80,33 @@ class FrameReader:
         """Yield frames in the order of their stamps."""
         return (item for item in self.stream() if isinstance(item, Frame))
 
-    def stream(self) -> Iterator[Frame | OdometrySample]:
-        """Yield every odometry message in its order, and the frames when they are complete."""
-        for raw in self._bag.raw_messages(self._router.topics):
-            yield from self._take(raw)
-        yield from self._synchronizer.flush()
-
     @property
     def ground_truth(self) -> Trajectory | None:
-        """The recording's ground truth as far as `graph_stream` was read; None without; raises a `BagError`."""
+        """The recording's ground truth as far as `stream` was read; None without; raises a `BagError`."""
         return decode_ground_truth(self._bag, self._truth)
 
-    def graph_stream(self) -> Iterator[Frame | OdometrySample | AbsoluteMeasurement]:
-        """Yield the same with absolute measurements, which only a pose graph takes."""
+    def stream(self) -> Iterator[Frame | OdometrySample | AbsoluteMeasurement]:
+        """Yield odometry and absolute measurements in their order, and the frames when they are complete."""
         for raw in self._bag.raw_messages([*self._router.topics, *self._absolute, GROUND_TRUTH_TOPIC]):
+            watchdog.feed()
             if raw.topic == GROUND_TRUTH_TOPIC:
                 self._truth.append(raw)
-            elif raw.topic in self._absolute:
-                yield from self._take_absolute(raw)
-            else:
-                yield from self._take(raw)
+                continue
+            with self._router.refusing(raw.topic):
+                self._take(raw.topic, decode(raw))
+            self.progress = (raw.log_ns - self._bag.start_ns) / max(1, self._bag.end_ns - self._bag.start_ns)
+            yield from self._samples
+            self._samples.clear()
+            yield from self._synchronizer.pop()
         yield from self._synchronizer.flush()
 
-    def _take(self, raw: RawMessage) -> Iterator[Frame | OdometrySample]:
-        watchdog.feed()
-        with self._router.refusing(raw.topic):
-            message = decode(raw)
+    def _take(self, topic: str, message: Any) -> None:
+        if topic in self._absolute:
+            measurement = self._decoder.decode(self._absolute[topic], message, stamp_ns(message))
+            self._samples += [] if measurement is None else [measurement]
+        else:
             self._add_odometry(message)
-            self._router.take(raw.topic, message)
-        self.progress = (raw.log_ns - self._bag.start_ns) / max(1, self._bag.end_ns - self._bag.start_ns)
-        yield from self._samples
-        self._samples.clear()
-        yield from self._synchronizer.pop()
-
-    def _take_absolute(self, raw: RawMessage) -> list[AbsoluteMeasurement]:
-        watchdog.feed()
-        measurement = None
-        with self._router.refusing(raw.topic):
-            message = decode(raw)
-            measurement = self._decoder.decode(self._absolute[raw.topic], message, stamp_ns(message))
-        return [] if measurement is None else [measurement]
+            self._router.take(topic, message)
 
     def _add_odometry(self, message: Any) -> None:
         """Add the poses of the trajectory up to the message's stamp that were not added before."""

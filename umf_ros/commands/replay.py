@@ -118,7 +118,7 @@ def command(
         console.print(line, **WARNING)
     replay = Replay(folder, settings, detector, unfinished is not None)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
-        stream = reader.graph_stream()
+        stream = reader.stream()
         for detection in replay.run(viewer.watch(stream) if viewer else stream):
             progress.show(reader.progress, detection)
             if viewer:

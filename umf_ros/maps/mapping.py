@@ -121,7 +121,7 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
     settings = settings.model_copy(update={"database": store})
     reader = FrameReader(bag, settings, opening.odometry_of(recording, settings))
     replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
-    for detection in replay.run(reader.graph_stream()):
+    for detection in replay.run(reader.stream()):
         on_frame(reader.progress, detection)
     has_odometry = replay.finish(count_drops(reader.counters))
     remember_recording(folder, bag)

@@ -267,6 +267,6 @@ def check_sensors(
     for item in FrameReader(bag, settings, odometry, warn=lambda _: None).stream():
         if isinstance(item, Frame):
             check.take(item)
-        else:
+        elif isinstance(item, OdometrySample):
             samples.append(item)
     return check.report(Trajectory.rising(one[:2] for one in samples) or instead)

@@ -108,7 +108,7 @@ def replay(task: SensorTask) -> None:
     task.folder.mkdir(parents=True)
     run = Replay(task.folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
     reader = FrameReader(recording, settings, None, warn=lambda text: None)
-    for _ in run.run(reader.graph_stream()):
+    for _ in run.run(reader.stream()):
         pass
     run.finish(count_drops(reader.counters))
     run.raise_if_frames_failed()

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import Database, Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame
@@ -144,10 +145,11 @@ class DriveReader:
         self._travelled: list[float] = []
         self._pooled: list[tuple[NDArray, ...]] = []
 
-    def take(self, item: Frame | OdometrySample) -> Detection | None:
+    def take(self, item: Frame | OdometrySample | AbsoluteMeasurement) -> Detection | None:
         """The next of the recording's stream; what became of it, if it is a frame."""
         if isinstance(item, OdometrySample):
             self._feed.take(item.stamp_ns, item.odom_T_body)
+        if not isinstance(item, Frame):
             return None
         detection = self._detector.process(item)
         for closure in detection.closures:

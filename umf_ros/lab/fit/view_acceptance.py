@@ -28,7 +28,7 @@ from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Loop, Verification
-from umf_ros.core.frames import Candidate, Frame, Keyframe
+from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, heading, relative, wrap_angle
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.fit.acceptance import (
@@ -225,8 +225,7 @@ def read(bag: Path) -> Recording:
     truth = read_ground_truth(recording)
     assert truth is not None, f"{bag} has no ground truth"
     detector = LoopDetector(settings, make_detector_embedder(settings))
-    frames = (item for item in FrameReader(recording, settings).stream() if isinstance(item, Frame))
-    found = [detector.embed(frame) for frame in frames if detector.select(frame)]
+    found = [detector.embed(frame) for frame in FrameReader(recording, settings) if detector.select(frame)]
     poses, known = truth.at(np.array([keyframe.stamp_ns for keyframe in found], np.int64))
     return Recording(bag.stem, [one for one, good in zip(found, known, strict=True) if good], poses[known])
 
