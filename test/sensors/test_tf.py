@@ -98,9 +98,9 @@ def test_a_transform_that_comes_late_is_used_then(calibration: Calibration) -> N
 def test_odometry_of_another_part_is_carried_to_the_body() -> None:
     told: list[str] = []
     frames = BodyFrames(FrameIds(), tree(("base_link", "imu", at(0.5))), told.append)
-    message = odometry(START_NS, np.eye(4))
+    message = odometry(START_NS, at(3))
     message.child_frame_id, message.header.frame_id = "imu", "vio"
-    np.testing.assert_allclose(frames.to_body(message, at(3)), at(2.5), atol=1e-12)
+    np.testing.assert_allclose(frames.odometry(message).odom_T_body, at(2.5), atol=1e-12)
     assert frames.odom == "vio" and told == []
 
 
@@ -109,31 +109,31 @@ def test_odometry_of_another_part_waits_for_transforms_that_come_late() -> None:
     told: list[str] = []
     transforms = StaticTransforms()
     frames = BodyFrames(FrameIds(), transforms, told.append, patience_s=2.0)
-    messages = [odometry(START_NS + second * 10**9, np.eye(4)) for second in range(4)]
+    messages = [odometry(START_NS + second * 10**9, at(3)) for second in range(4)]
     for message in messages:
         message.child_frame_id = "imu"
     for message in messages[:2]:  # counted, like everything that cannot be used
         with pytest.raises(MessageError, match="waits for its transform on /tf_static") as caught:
-            frames.to_body(message, at(3))
+            frames.odometry(message)
         assert caught.value.kind == "transforms"
     transforms.add(SimpleNamespace(transforms=[stamped("base_link", "imu", at(0.5))]))
-    np.testing.assert_allclose(frames.to_body(messages[1], at(3)), at(2.5), atol=1e-12)
+    np.testing.assert_allclose(frames.odometry(messages[1]).odom_T_body, at(2.5), atol=1e-12)
     patient = BodyFrames(FrameIds(), StaticTransforms(), told.append, patience_s=2.0)
     with pytest.raises(MessageError, match="waits for its transform on /tf_static"):
-        patient.to_body(messages[0], at(3))
+        patient.odometry(messages[0])
     assert told == []
-    np.testing.assert_array_equal(patient.to_body(messages[3], at(3)), at(3))
+    np.testing.assert_array_equal(patient.odometry(messages[3]).odom_T_body, at(3))
     assert len(told) == 1
 
 
 def test_unknown_parts_are_told_and_two_sources_on_a_topic_refused() -> None:
     told: list[str] = []
     frames = BodyFrames(FrameIds(), StaticTransforms(), told.append)
-    message = odometry(START_NS, np.eye(4))
+    message = odometry(START_NS, at(3))
     message.child_frame_id = "wheels"
-    np.testing.assert_array_equal(frames.to_body(message, at(3)), at(3))
+    np.testing.assert_array_equal(frames.odometry(message).odom_T_body, at(3))
     assert len(told) == 1 and "the odometry is that of wheels" in told[0]
-    other = odometry(START_NS, np.eye(4))
+    other = odometry(START_NS, at(3))
     with pytest.raises(MessageError, match="two sources on one topic") as caught:
-        frames.to_body(other, at(3))
+        frames.odometry(other)
     assert caught.value.kind == "frame"

@@ -13,6 +13,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -24,19 +25,21 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from umf_ros.core import watchdog
-from umf_ros.core.config import Settings, Topics
+from umf_ros.core.config import Settings, Topics, topics_of
 from umf_ros.core.errors import ConfigError, MessageError, OutputError, UmfError, either
 from umf_ros.core.io import check_writable
-from umf_ros.nodes.conversions import from_time, latched
+from umf_ros.nodes.conversions import from_time, latched, sensor_qos
 from umf_ros.nodes.diagnostics import WARN, InputWatch
 from umf_ros.nodes.parameters import changed_settings, declare
 from umf_ros.nodes.process import Worker
 from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.tf import PATIENCE_S, TOPIC, BodyFrames, StaticTransforms
 from umf_ros.sensors.topic_finder import FRONT_END, SETTLING_S, TopicFinder, describe_inputs, must_find
 
 STATIC_QOS = latched(100)
 """Deep enough for several broadcasters, each with a part of the tree."""
+ODOMETRY_DEPTH = 200
 WATCH_S = 1.0
 HEARTBEAT_S = 0.05
 CLOCK_PATIENCE_S = 30.0
@@ -296,6 +299,16 @@ class BaseNode(LifecycleNode, ABC):
         subscription = self.create_subscription(kind, topic, self._guarded(name, receive), qos, event_callbacks=events)
         watch = InputWatch(self, name, subscription.topic_name, kind, rare)
         self._watches.append(watch)
+
+    def _subscribe_odometry(
+        self, take: Callable[[OdometrySample], None], calibration: Calibration | None = None
+    ) -> BodyFrames:
+        """Subscribe to the odometry and to `/tf_static`; `take` gets the poses of the body."""
+        frames, topics = self._subscribe_transforms(calibration), topics_of(self._settings)
+        if topics.odometry:
+            name, qos = self._own_topic("odometry", topics), sensor_qos(self._settings.qos, ODOMETRY_DEPTH)
+            self._subscribe("odometry", Odometry, name, lambda message: take(frames.odometry(message)), qos)
+        return frames
 
     def _subscribe_transforms(self, calibration: Calibration | None = None) -> BodyFrames:
         """Subscribe to `/tf_static` for extrinsics and the odometry's frame; Jazzy from PyPI lacks tf2_msgs."""

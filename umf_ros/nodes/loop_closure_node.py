@@ -29,21 +29,9 @@ from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line
 from umf_ros.core.frames import Frame, Keyframe, LoopClosure, State
 from umf_ros.core.geometry import Array, rotation_angle
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
+from umf_ros.nodes import conversions as messages
 from umf_ros.nodes.base_node import BaseNode
-from umf_ros.nodes.conversions import (
-    CLOSURES_QOS,
-    LATCHED_QOS,
-    MAX_LINES,
-    SCAN_FIELDS,
-    closure_to_message,
-    keyframe_frame,
-    sensor_qos,
-    to_cloud,
-    to_header,
-    to_markers,
-    to_pose,
-    to_time,
-)
+from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, MAX_LINES, SCAN_FIELDS
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.runs.writer import RunRecorder, count_drops, with_places
@@ -98,7 +86,7 @@ class LoopClosureNode(BaseNode):
         for name, topic in topics.model_dump().items():
             if topic:
                 take = partial(self._enqueue, topic)
-                qos = sensor_qos(settings.qos)
+                qos = messages.sensor_qos(settings.qos)
                 self._subscribe(name, MESSAGE_TYPES[name], self._own_topic(name, topics), take, qos)
         if settings.grows_map:
             self._adder: Worker[Callable[[], None]] = Worker(lambda step: step(), self._report_fault, 1)
@@ -260,7 +248,7 @@ class ClosurePublisher:
     def publish_closures(self, detection: Detection) -> None:
         """Publish the closures of one detection."""
         for closure in detection.closures:
-            self._closures.publish(closure_to_message(closure))
+            self._closures.publish(messages.closure_to_message(closure))
 
     def announce(self, detection: Detection, matches: dict[int, Keyframe]) -> None:
         """Publish the rest of one detection; `matches` are the matched keyframes by stamp, for the markers."""
@@ -268,14 +256,14 @@ class ClosurePublisher:
         if keyframe is None:
             return
         # without odometry a keyframe is at the origin of its own frame
-        known = keyframe.odom_T_body is not None
-        header = to_header(keyframe.stamp_ns, self.odom if known else keyframe_frame(keyframe.stamp_ns))
-        pose = to_pose(np.eye(4) if keyframe.odom_T_body is None else keyframe.odom_T_body)
+        frame = messages.keyframe_frame(keyframe.stamp_ns) if keyframe.odom_T_body is None else self.odom
+        header = messages.to_header(keyframe.stamp_ns, frame)
+        pose = messages.to_pose(np.eye(4) if keyframe.odom_T_body is None else keyframe.odom_T_body)
         self._keyframes.publish(PoseStamped(header=header, pose=pose))
         if len(keyframe.points) and self._scans.get_subscription_count():
             viewpoints = np.broadcast_to(keyframe.body_T_lidar[:3, 3], keyframe.points.shape)
-            header = to_header(keyframe.stamp_ns, self._base)
-            self._scans.publish(to_cloud(np.hstack([keyframe.points, viewpoints]), SCAN_FIELDS, header))
+            header = messages.to_header(keyframe.stamp_ns, self._base)
+            self._scans.publish(messages.to_cloud(np.hstack([keyframe.points, viewpoints]), SCAN_FIELDS, header))
         if detection.verdicts:
             self._report(keyframe, detection.verdicts)
             self._draw(keyframe, detection.verdicts, matches)
@@ -283,7 +271,7 @@ class ClosurePublisher:
     def publish_inter_robot(self, inter_closure: InterRobotClosure) -> None:
         """Publish closures with another rover's places, with the names of both rovers."""
         for closure in inter_closure.closures:
-            self._closures.publish(closure_to_message(closure, inter_closure.own, inter_closure.robot))
+            self._closures.publish(messages.closure_to_message(closure, inter_closure.own, inter_closure.robot))
         self._report(inter_closure.keyframe, inter_closure.verdicts, inter_closure.robot)
 
     def wait_for_subscribers(self) -> None:
@@ -292,9 +280,9 @@ class ClosurePublisher:
 
     def _report(self, keyframe: Keyframe, verdicts: list[Hypothesis], robot: str = "") -> None:
         """Publish the tested candidates of a keyframe."""
-        report = DiagnosticArray(header=Header(stamp=to_time(keyframe.stamp_ns)))
+        report = DiagnosticArray(header=Header(stamp=messages.to_time(keyframe.stamp_ns)))
         for verdict in verdicts:
-            name = f"{keyframe_frame(verdict.candidate.stamp_ns, robot)} -> {keyframe.stamp_ns}"
+            name = f"{messages.keyframe_frame(verdict.candidate.stamp_ns, robot)} -> {keyframe.stamp_ns}"
             level = WARN if verdict.closure is None else OK
             numbers = {"similarity": verdict.candidate.similarity, **verdict.numbers}
             report.status.append(status(level, name, verdict.outcome, numbers))
@@ -309,8 +297,9 @@ class ClosurePublisher:
                 continue
             lines = self._rejected if verdict.closure is None else self._accepted
             lines.append(np.stack([match.odom_T_body[:3, 3], keyframe.odom_T_body[:3, 3]]))
-        header = to_header(keyframe.stamp_ns, self.odom)
-        self._markers.publish(to_markers({State.ACCEPTED: self._accepted, State.REJECTED: self._rejected}, header))
+        header = messages.to_header(keyframe.stamp_ns, self.odom)
+        drawn = {State.ACCEPTED: self._accepted, State.REJECTED: self._rejected}
+        self._markers.publish(messages.to_markers(drawn, header))
 
 
 def describe(number: int, closure: LoopClosure) -> str:

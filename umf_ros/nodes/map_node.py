@@ -10,27 +10,25 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from nav_msgs.msg import OccupancyGrid, Odometry
+from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import QoSProfile
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2
 
 from umf_ros.core import watchdog
-from umf_ros.core.config import Settings, topics_of
+from umf_ros.core.config import Settings
 from umf_ros.core.errors import MessageError, UmfError
-from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.nodes.base_node import BaseNode
-from umf_ros.nodes.conversions import LATCHED_QOS, SCAN_FIELDS, from_time, sensor_qos, to_cloud, to_header
+from umf_ros.nodes.conversions import LATCHED_QOS, SCAN_FIELDS, from_time, to_cloud, to_header
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
-from umf_ros.sensors.decode import decode_odometry, stamp_ns
+from umf_ros.sensors.decode import OdometrySample, decode_pose, stamp_ns
 from umf_ros.sensors.topic_finder import BACK_END
 from umf_ros.terrain.grid import TerrainGrid, make_grid, write_terrain
 from umf_ros.terrain.voxels import LivingMap
 
-ODOMETRY_DEPTH, SCAN_DEPTH, QUEUE = 200, 50, 10_000
+SCAN_DEPTH, QUEUE = 50, 10_000
 MOST_ADDED = 10_000
 """Scans and odometry messages after which the map is updated also without subscribers: an update frees memory."""
 RESTING = 4.0
@@ -44,8 +42,7 @@ class MapNode(BaseNode):
         super().__init__("map_node", "folder for map.yaml, map.pgm and elevation.tif; empty: none", BACK_END)
 
     def _open(self) -> None:
-        settings, topics = self._settings, topics_of(self._settings)
-        self._map = LivingMap(settings.terrain)
+        self._map = LivingMap(self._settings.terrain)
         self._path: PathMessage | None = None
         self._version, self._sent = 0, {"cloud": 0, "grid": 0}
         self._due_s, self._bytes, self._queued = 0.0, 0, False
@@ -54,9 +51,7 @@ class MapNode(BaseNode):
             "grid": self.create_publisher(OccupancyGrid, "~/map_grid", LATCHED_QOS),
         }
         self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._report_fault, QUEUE)
-        self._body_frames = self._subscribe_transforms()
-        qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
-        self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
+        self._subscribe_odometry(self._on_odometry)
         scans = "loop_closure_node/keyframe_scans"
         self._subscribe("scans", PointCloud2, scans, self._on_scan, QoSProfile(depth=SCAN_DEPTH), rare=True)
         self._subscribe("path", PathMessage, "pose_graph_node/path", self._on_path, LATCHED_QOS, rare=True)
@@ -72,10 +67,8 @@ class MapNode(BaseNode):
     def _retune(self, settings: Settings) -> None:
         """Nothing of the map changes while the node runs."""
 
-    def _on_odometry(self, message: Odometry) -> None:
-        sample = decode_odometry(message)
-        pose = self._body_frames.to_body(message, sample.odom_T_body)
-        self._worker.submit(lambda: self._map.add_odometry(sample.stamp_ns, pose))
+    def _on_odometry(self, sample: OdometrySample) -> None:
+        self._worker.submit(lambda: self._map.add_odometry(sample.stamp_ns, sample.odom_T_body))
 
     def _on_scan(self, message: PointCloud2) -> None:
         self._worker.submit(lambda: self._take_scan(message))
@@ -102,7 +95,8 @@ class MapNode(BaseNode):
     def _update(self) -> None:
         path, self._path = self._path, None
         if path is not None:
-            self._map.correct(_trajectory(path))
+            poses = {from_time(one.header.stamp): decode_pose(one.pose) for one in path.poses}
+            self._map.correct(Trajectory.rising(sorted(poses.items())))
         self._version += self._map.update()
 
     def _show(self) -> None:
@@ -163,18 +157,6 @@ def to_grid(grid: TerrainGrid, header: Any) -> OccupancyGrid:
     message.info.origin.orientation.w = 1.0
     message.data = array("b", grid.cells.tobytes())
     return message
-
-
-def _trajectory(message: PathMessage) -> Trajectory:
-    """Return the poses of a path, in the order of their stamps."""
-    stamps = np.array([from_time(one.header.stamp) for one in message.poses], np.int64)
-    places = [(one.pose.position, one.pose.orientation) for one in message.poses]
-    poses: Array = np.tile(np.eye(4), (len(stamps), 1, 1))
-    if len(stamps):
-        poses[:, :3, 3] = [(at.x, at.y, at.z) for at, _ in places]
-        poses[:, :3, :3] = Rotation.from_quat([(q.x, q.y, q.z, q.w) for _, q in places]).as_matrix()
-    stamps, first = np.unique(stamps, return_index=True)
-    return Trajectory(stamps, poses[first])
 
 
 def main() -> None:

@@ -23,31 +23,22 @@ from visualization_msgs.msg import MarkerArray
 
 from umf_ros.absolute.measurement import AbsoluteDecoder, Aid
 from umf_ros.core import watchdog
-from umf_ros.core.config import Settings, topics_of
+from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.graph_process import JOURNAL, ProcessEndedError, start_graph
 from umf_ros.nodes import conversions as messages
-from umf_ros.nodes.base_node import BaseNode
-from umf_ros.nodes.conversions import (
-    CLOSURES_QOS,
-    LATCHED_QOS,
-    closure_by_hand,
-    closure_from_message,
-    is_between_rovers,
-    parse_pair,
-    sensor_qos,
-)
+from umf_ros.nodes.base_node import ODOMETRY_DEPTH, BaseNode
+from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, parse_pair
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.sensors.calibration import Calibration, calibration_of
-from umf_ros.sensors.decode import OdometrySample, decode_odometry, stamp_ns
+from umf_ros.sensors.decode import OdometrySample, stamp_ns
 from umf_ros.sensors.topic_finder import BACK_END
 
 if find_spec("gtsam") is None:  # before inputs are searched: the process of the graph imports it
     raise ModuleNotFoundError("gtsam is not installed", name="gtsam")
-ODOMETRY_DEPTH = 200
 # minutes of fast odometry: none is lost while the optimiser works
 QUEUE = 100_000
 FRONT_END = "loop_closure_node"
@@ -87,13 +78,9 @@ class PoseGraphNode(BaseNode):
         self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._on_failure, QUEUE)
         if self._state.unsettled:
             self._worker.submit(lambda: self._settle_previous())
-        topics = topics_of(settings)
         is_aided = bool(settings.absolute.gnss or settings.absolute.imu)
         calibration = calibration_of(settings) if is_aided else None
-        self._odometry_frames = self._subscribe_transforms(calibration)
-        if topics.odometry:
-            qos = sensor_qos(settings.qos, ODOMETRY_DEPTH)
-            self._subscribe("odometry", Odometry, self._own_topic("odometry", topics), self._on_odometry, qos)
+        self._odometry_frames = self._subscribe_odometry(self._on_odometry, calibration)
         self._subscribe("closures", Odometry, "loop_closures", self._on_closure, CLOSURES_QOS, rare=True)
         if calibration is not None:
             self._subscribe_absolute(calibration)
@@ -150,7 +137,7 @@ class PoseGraphNode(BaseNode):
 
     def _subscribe_absolute(self, calibration: Calibration) -> None:
         """Hear GNSS and IMU where their topics are named."""
-        topics, qos = self._settings.absolute, sensor_qos(self._settings.qos, ODOMETRY_DEPTH)
+        topics, qos = self._settings.absolute, messages.sensor_qos(self._settings.qos, ODOMETRY_DEPTH)
         find = self._odometry_frames.pose_of
         self._decoder = AbsoluteDecoder(calibration.antenna, calibration.body_T_imu, find)
         if topics.gnss:
@@ -171,9 +158,7 @@ class PoseGraphNode(BaseNode):
         self._transform_publisher = self.create_publisher(TransformStamped, "~/map_to_odom", 50)
         self._broadcast = _broadcaster(self) if self._frames.publish_tf else None
 
-    def _on_odometry(self, message: Odometry) -> None:
-        sample = decode_odometry(message)
-        sample = OdometrySample(sample.stamp_ns, self._odometry_frames.to_body(message, sample.odom_T_body))
+    def _on_odometry(self, sample: OdometrySample) -> None:
         if self._odometry_frames.odom != self._frames.odom:
             self._frames = self._frames.model_copy(update={"odom": self._odometry_frames.odom})
         self._worker.submit(lambda: self._add_odometry(sample))
@@ -190,9 +175,9 @@ class PoseGraphNode(BaseNode):
             self._broadcast(transform)
 
     def _on_closure(self, message: Odometry) -> None:
-        if is_between_rovers(message):
+        if messages.is_between_rovers(message):
             return
-        closure = closure_from_message(message)
+        closure = messages.closure_from_message(message)
         self._closures_taken += 1
         self._worker.submit(lambda: self._add_closure(closure))
 
@@ -294,7 +279,7 @@ class PoseGraphNode(BaseNode):
 
     def _add_by_hand(self, request: AddDiagnostics.Request) -> str:
         """Accept the closures between two keyframes; with a pose in the request, that is a new one."""
-        pair, closure = closure_by_hand(request.load_namespace)
+        pair, closure = messages.closure_by_hand(request.load_namespace)
         if closure is not None:
             self._announce(self._durable.add_closure(closure))
         return self._decide_by_hand(AddDiagnostics.Request(load_namespace=pair), State.ACCEPTED)

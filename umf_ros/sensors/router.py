@@ -78,10 +78,8 @@ class MessageRouter:
 
     def _take(self, entry: str, message: Any) -> None:
         if entry == ODOMETRY:
-            sample = decode_odometry(message)
-            if self._frames is not None:
-                sample = sample._replace(odom_T_body=self._frames.to_body(message, sample.odom_T_body))
-            self.take_odometry(sample)
+            read = self._frames.odometry if self._frames is not None else decode_odometry
+            self.take_odometry(read(message))
         elif entry in ("left_info", "right_info"):
             self._use_info(entry, message)
         else:

@@ -11,7 +11,7 @@ from umf_ros.core.config import FrameIds
 from umf_ros.core.errors import MessageError
 from umf_ros.core.geometry import Array, from_quaternion, invert
 from umf_ros.sensors.calibration import Calibration
-from umf_ros.sensors.decode import stamp_ns
+from umf_ros.sensors.decode import OdometrySample, decode_odometry
 
 TOPIC = "/tf_static"
 _UP = 0.9
@@ -136,25 +136,27 @@ class BodyFrames:
         self._poses[name] = pose
         return {name: pose}
 
-    def to_body(self, message: Any, odom_T_part: Array) -> Array:
-        """Return (4, 4) `odom_T_body` of a nav_msgs/Odometry whose pose is `odom_T_part`.
+    def odometry(self, message: Any) -> OdometrySample:
+        """Return the pose of the body by a nav_msgs/Odometry of any part of the robot.
 
         Raises:
-            MessageError: of kind "frame": another source than the first message's; of kind "transforms": not yet known.
+            MessageError: of kind "frame": another source than the first message's; of kind "transforms": not yet known;
+                or as `decode_odometry`.
         """
+        sample = decode_odometry(message)
         names = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
         if self._names is None:
             self._names = names
             self.odom = names[0] or self.odom
-            self._first_ns = stamp_ns(message)
+            self._first_ns = sample.stamp_ns
         if names != self._names:
             before, now = (" to ".join(map(repr, pair)) for pair in (self._names, names))
             raise MessageError("frame", f"odometry from {now}, after that from {before}: two sources on one topic?")
         if self._part_T_body is None:
-            self._part_T_body = self._look_up(names[1], stamp_ns(message) - self._first_ns)
+            self._part_T_body = self._look_up(names[1], sample.stamp_ns - self._first_ns)
         if self._part_T_body is None:
             raise MessageError("transforms", f"odometry of {names[1]} waits for its transform on {TOPIC}")
-        return np.asarray(odom_T_part @ self._part_T_body)
+        return sample._replace(odom_T_body=sample.odom_T_body @ self._part_T_body)
 
     def _look_up(self, part: str, waited_ns: int) -> Array | None:
         """Return `part_T_body`; None while the transform may still arrive."""

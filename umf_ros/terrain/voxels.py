@@ -198,8 +198,8 @@ class LivingMap:
         self._scans.append((stamp_ns, np.rint(points / UNIT_M).astype(np.int16), viewpoint))
         self.added += 1
 
-    def correct(self, path: Trajectory) -> None:
-        """Set the corrected path, `map_T_body`."""
+    def correct(self, path: Trajectory | None) -> None:
+        """Set the corrected path, `map_T_body`; None: there is none."""
         self._path = path
 
     def update(self) -> bool:
