@@ -161,15 +161,9 @@ class DurableGraph:
         differing = f"; {self.changed} verdicts differ from before" if self.changed else ""
         return f"recovered: {odometry} odometry messages, closures: {verdicts or 'none'}{differing}"
 
-    def closures(self, pair: tuple[int, int] | None = None) -> list[ClosureVerdict]:
-        """Return the latest verdict of every closure, or of those between two keyframes."""
-        found = self.graph.closures()
-        return found if pair is None else [verdict for verdict in found if verdict.closure.pair == pair]
-
-    def last_accepted(self) -> LoopClosure | None:
-        """Return the accepted closure that arrived last."""
-        found = self.graph.closures()
-        return next((one.closure for one in reversed(found) if one.state is State.ACCEPTED), None)
+    def closures(self) -> list[ClosureVerdict]:
+        """Return the latest verdict of every closure, in order of arrival."""
+        return self.graph.closures()
 
     def drawing(self) -> tuple[Stamps, Array, dict[State, Array], dict[State, Array]]:
         """Return what is drawn in the map.

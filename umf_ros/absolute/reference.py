@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from umf_ros.absolute.consistency import STRETCH_M, MeasuredPath, Rows, Track, apply, turned
 from umf_ros.absolute.elevation import ElevationModel, load_elevation
@@ -427,7 +428,4 @@ def _first_pose_noise(pose: Array, sources: set[Aid]) -> gtsam.noiseModel.Base:
 
 def _upright(up: Array) -> Array:
     """Return the rotation (4, 4) of a direction to the vertical along the shortest arc."""
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    sine = float(np.linalg.norm(axis))
-    angle = np.arctan2(sine, up[2])
-    return make_pose(gtsam.Rot3.Expmap(axis / max(sine, 1e-12) * angle).matrix(), np.zeros(3))
+    return make_pose(Rotation.align_vectors([0.0, 0.0, 1.0], up)[0].as_matrix(), np.zeros(3))

@@ -10,21 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from umf_ros.commands.recordings import (
-    ConfigPath,
-    DatasetName,
-    EmbedderName,
-    OdometryFrame,
-    WeightsPath,
-    check_files,
-    check_odometry_options,
-)
+from umf_ros.commands import recordings as options
 from umf_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.maps.map_folder import MapFolder, MapSession
+    from umf_ros.maps.map_folder import MapFolder
     from umf_ros.maps.mapping import Opening
 
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.")]
@@ -66,31 +58,32 @@ app = typer.Typer(cls=_MakeOrChange, rich_markup_mode="rich")
 def command(
     recordings: Recordings,
     out: MapPath = Path("map"),
-    config: ConfigPath = None,
-    dataset: DatasetName = "auto",
-    embedder: EmbedderName = None,
-    weights: WeightsPath = None,
+    config: options.ConfigPath = None,
+    dataset: options.DatasetName = "auto",
+    embedder: options.EmbedderName = None,
+    weights: options.WeightsPath = None,
     workers: Workers = 1,
     ray: RayAddress = None,
     odometry: OdometryFolder = None,
-    odometry_frame: OdometryFrame = "",
+    odometry_frame: options.OdometryFrame = "",
 ) -> None:
     """Make one map of many recordings, or add recordings to one.
 
     Every recording is a session with its own odometry; closures within and between them make one pose graph.
     Recordings that are in the map already are skipped, so only new ones take time.
     """
-    check_files(recordings[0], config, odometry)
-    odometry_frame = check_odometry_options(odometry, odometry_frame)
+    options.check_files(recordings[0], config, odometry)
+    odometry_frame = options.check_odometry_options(odometry, odometry_frame)
 
     from rich.console import Console
+    from rich.progress import track
 
     from umf_ros.bags.reader import open_bag
     from umf_ros.core.io import check_writable
     from umf_ros.core.tasks import spread
     from umf_ros.maps.joint_graph import solve
     from umf_ros.maps.map_folder import MapFolder
-    from umf_ros.maps.mapping import Opening, find_recordings, unmatched
+    from umf_ros.maps.mapping import Opening, find_recordings, match_session, unmatched
     from umf_ros.maps.outputs import write_results
 
     console = Console()
@@ -105,7 +98,9 @@ def command(
     else:
         _add_all(target, new, opening, partial(spread, workers=workers, ray=ray), console)
     for session in unmatched(target):
-        _match(target, session, console)
+        title = f"Matching {session.name} with the map"
+        for _ in track(match_session(target, session), title, session.places, console=console, transient=True):
+            pass
     with console.status("Solving the joint graph"):
         summary = write_results(target, solve(target))
     _print_summary(out, summary, console)
@@ -170,7 +165,7 @@ def grow_map(
 def export(
     map_folder: Annotated[Path, typer.Argument(help="Folder of the map.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the files; the map's by default.")] = None,
-    config: ConfigPath = None,
+    config: options.ConfigPath = None,
 ) -> None:
     """Write where a rover can drive, as map.yaml and map.pgm for Nav2's map server, and the elevation as a GeoTIFF.
 
@@ -229,25 +224,14 @@ def _add_all(
 
 
 def _add(target: MapFolder, name: str, recording: Path, opening: Opening, console: Console) -> None:
-    """Replay a recording into the map, and match it with the earlier ones."""
+    """Replay a recording into the map."""
     from umf_ros.commands.console import FrameProgress
     from umf_ros.maps.mapping import add_session, replay_session
 
     console.print(f"{recording}: session {name}", markup=False, soft_wrap=True)
     with FrameProgress(console) as progress:
         replay_session(recording, opening, target.folder_of(name), progress.show)
-    _match(target, add_session(target, name, recording), console)
-
-
-def _match(target: MapFolder, session: MapSession, console: Console) -> None:
-    """Match a session with the earlier ones."""
-    from rich.progress import track
-
-    from umf_ros.maps.mapping import match_session
-
-    title = f"Matching {session.name} with the map"
-    for _ in track(match_session(target, session), title, session.places, console=console, transient=True):
-        pass
+    add_session(target, name, recording)
 
 
 def _print_summary(out: Path, summary: dict[str, Any], console: Console) -> None:

@@ -9,22 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from umf_ros.commands.recordings import (
-    BagPath,
-    ConfigPath,
-    DatasetName,
-    EmbedderName,
-    OdometryFrame,
-    OdometryPath,
-    RunsFolder,
-    TruthPath,
-    WeightsPath,
-    check_files,
-    check_map,
-    check_odometry_options,
-    open_frames,
-    open_recording,
-)
+from umf_ros.commands import recordings as options
 from umf_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -47,15 +32,15 @@ MapPath = Annotated[
 
 
 def command(
-    bag: BagPath,
-    config: ConfigPath = None,
-    out: RunsFolder = Path("results"),
-    dataset: DatasetName = "auto",
-    embedder: EmbedderName = None,
-    weights: WeightsPath = None,
-    odometry: OdometryPath = None,
-    odometry_frame: OdometryFrame = "",
-    ground_truth: TruthPath = None,
+    bag: options.BagPath,
+    config: options.ConfigPath = None,
+    out: options.RunsFolder = Path("results"),
+    dataset: options.DatasetName = "auto",
+    embedder: options.EmbedderName = None,
+    weights: options.WeightsPath = None,
+    odometry: options.OdometryPath = None,
+    odometry_frame: options.OdometryFrame = "",
+    ground_truth: options.TruthPath = None,
     min_probability: MinProbability = None,
     resume: Resume = False,
     rerun: RerunPath = None,
@@ -68,11 +53,11 @@ def command(
     Ctrl-C ends the run early and keeps its results; --resume continues it, also after a crash. Exit status 3: the
     inputs could not give any result.
     """
-    check_files(bag, config, odometry, ground_truth)
-    check_map(map_folder)
-    odometry_frame = check_odometry_options(odometry, odometry_frame)
+    options.check_files(bag, config, odometry, ground_truth)
+    options.check_map(map_folder)
+    odometry_frame = options.check_odometry_options(odometry, odometry_frame)
 
-    recording, settings = open_recording(
+    recording, settings = options.open_recording(
         bag,
         config,
         dataset,
@@ -101,7 +86,7 @@ def command(
     console = Console()
     _tell_inputs(console, settings)
     warnings: list[str] = []
-    reader = open_frames(recording, settings, partial(_warn, console, warnings), odometry, odometry_frame)
+    reader = options.open_frames(recording, settings, partial(_warn, console, warnings), odometry, odometry_frame)
     truth = read_ground_truth(None, ground_truth)
     if settings.localizing and rerun:
         raise ConfigError("--rerun is for mapping runs: leave it out with --map")

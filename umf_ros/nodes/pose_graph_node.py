@@ -264,17 +264,17 @@ class PoseGraphNode(BaseNode):
         return status(level, "pose graph", text, values)
 
     def _reject_last(self) -> str:
-        last = self._durable.last_accepted()
-        if last is None:
+        accepted = [one.closure for one in self._durable.closures() if one.state is State.ACCEPTED]
+        if not accepted:
             raise UmfError("no closure is accepted")
-        self._announce(self._durable.decide_by_hand(*last.pair, State.REJECTED))
-        return f"closure {_name(last)} revoked"
+        self._announce(self._durable.decide_by_hand(*accepted[-1].pair, State.REJECTED))
+        return f"closure {_name(accepted[-1])} revoked"
 
     def _decide_by_hand(self, request: AddDiagnostics.Request, state: State) -> str:
         """Decide about the closures between two keyframes that the request's text names."""
         pair = parse_pair(request.load_namespace)
         self._announce(self._durable.decide_by_hand(*pair, state))
-        told = self._durable.closures(pair)
+        told = [one for one in self._durable.closures() if one.closure.pair == pair]
         return "; ".join(f"closure {_name(one.closure)} {one.state.value}: {one.reason}" for one in told)
 
     def _add_by_hand(self, request: AddDiagnostics.Request) -> str:
