@@ -44,9 +44,8 @@ class Drive:
         self.model = self._write("right", world.heights)
 
     def _write(self, name: str, heights: Array) -> str:
-        path = self._folder / f"{name}.npz"
-        x, y = self._world.corner
-        np.savez(path, heights=heights, cell_m=self._world.cell_m, x0_m=x, y0_m=y)
+        path = self._folder / f"{name}.asc"
+        replace(self._world, heights=heights).write_heights(path)
         return str(path)
 
     def wrong_model(self, seed: int) -> str:

@@ -31,9 +31,10 @@ def check(model: ElevationModel, tolerance_m: float = 1e-6) -> None:
     assert not model.at(np.array([[-5.0, 50.0], [50.0, 400.0]]))[2].any()
 
 
-def test_arrays(tmp_path: Path) -> None:
-    np.savez(tmp_path / "model.npz", heights=grid(4.0), cell_m=4.0, x0_m=0.0, y0_m=0.0)
-    model = load_elevation(tmp_path / "model.npz", 0.3, None)
+def test_ascii_grid_by_centres_can_be_shifted(tmp_path: Path) -> None:
+    head = "ncols 50\nnrows 50\nxllcenter 0\nyllcenter 0\ncellsize 4\nnodata_value -9999"
+    np.savetxt(tmp_path / "model.asc", grid(4.0)[::-1], header=head, comments="")
+    model = load_elevation(tmp_path / "model.asc", 0.3, None)
     check(model)
     moved = model.shifted(np.array([20.0, 10.0]))
     assert moved.at(np.array([[70.0, 60.0]]))[0] == pytest.approx(model.at(np.array([[50.0, 50.0]]))[0])
@@ -63,7 +64,7 @@ def test_geotiff_in_utm(tmp_path: Path) -> None:
         load_elevation(tmp_path / "model.tif", 0.3, None)
 
 
-@pytest.mark.parametrize("name", ["missing.npz", "missing.tif", "text.asc"])
+@pytest.mark.parametrize("name", ["missing.asc", "missing.tif", "text.asc"])
 def test_a_file_that_is_no_model_is_one_line(tmp_path: Path, name: str) -> None:
     (tmp_path / "text.asc").write_text("hello", encoding="ascii")
     with pytest.raises(ConfigError, match="elevation model") as error:

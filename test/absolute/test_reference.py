@@ -60,8 +60,8 @@ def plain_m() -> float:
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("model") / "model.npz"
-    np.savez(path, heights=WORLD.heights, cell_m=WORLD.cell_m, x0_m=WORLD.corner[0], y0_m=WORLD.corner[1])
+    path = tmp_path_factory.mktemp("model") / "model.asc"
+    WORLD.write_heights(path)
     return str(path)
 
 

@@ -1,4 +1,4 @@
-"""Elevation models: heights of the ground on a grid, from GeoTIFF files or plain grids."""
+"""Elevation models: heights of the ground on a grid, from GeoTIFF files or ESRI ASCII grids."""
 
 from __future__ import annotations
 
@@ -92,9 +92,7 @@ def _plane(point: Array, normal: Array, sigma_m: float) -> Callable[[int], gtsam
 
 
 def load_elevation(path: Path, sigma_m: float, origin: Array | None) -> ElevationModel:
-    """Read a GeoTIFF, an ESRI ASCII grid (.asc), or an .npz with `heights`, `cell_m`, `x0_m` and `y0_m`.
-
-    In an .npz, `x0_m`, `y0_m` are the centre of the first cell; columns go east, rows north.
+    """Read a GeoTIFF or an ESRI ASCII grid (.asc).
 
     Args:
         path: the file.
@@ -106,26 +104,15 @@ def load_elevation(path: Path, sigma_m: float, origin: Array | None) -> Elevatio
         ConfigError: the file cannot be read, or rasterio is not installed.
     """
     with reading(f"elevation model {path}", ConfigError, "cannot be read"):
-        if path.suffix == ".npz":
-            heights, to_pixel = _read_arrays(path)
-        elif path.suffix == ".asc":
-            heights, to_pixel = _read_ascii(path)
-        else:
-            heights, to_pixel = _read_geotiff(path, origin)
+        heights, to_pixel = _read_ascii(path) if path.suffix == ".asc" else _read_geotiff(path, origin)
     if heights.ndim != 2 or min(heights.shape) < 2 or not np.isfinite(to_pixel).all():
         raise ConfigError(f"elevation model {path} is not a grid of heights")
     cell_m = float(1 / np.sqrt(abs(np.linalg.det(to_pixel[:, :2]))))
     return ElevationModel(heights, to_pixel, cell_m, sigma_m)
 
 
-def _read_arrays(path: Path) -> tuple[Array, Array]:
-    """Return heights and `pixel_T_world`, like the other readers."""
-    with np.load(path) as stored:
-        heights, cell, x0, y0 = (np.asarray(stored[name], float) for name in ("heights", "cell_m", "x0_m", "y0_m"))
-    return heights, np.array([[1, 0, -x0], [0, 1, -y0]], float) / float(cell)
-
-
 def _read_ascii(path: Path) -> tuple[Array, Array]:
+    """Return heights and `pixel_T_world`, as for a GeoTIFF."""
     lines = path.read_text(encoding="ascii").splitlines()
     head = {name.lower(): float(value) for name, value in (line.split() for line in lines[:6])}
     heights = np.loadtxt(lines[6:])

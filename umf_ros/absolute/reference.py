@@ -261,9 +261,7 @@ class AbsoluteReference:
                 self.worlds[component] = world
             known = component in self.worlds
             if known:
-                path = MeasuredPath(
-                    path.odometry, self.worlds[component] @ path.poses, path.travel, path.finished, path.at_middle
-                )
+                path = replace(path, poses=self.worlds[component] @ path.poses)
             track.judge(measured, path, known)
             if track.factors and not known:
                 self.worlds[component] = _upright(apply(path.poses, measured).mean(axis=0))

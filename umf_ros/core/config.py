@@ -182,7 +182,7 @@ class PoseGraphSettings(Group):
     origin: str = Field(
         "", description="latitude, longitude (deg) and height (m) of the world frame; empty: the first good GNSS fixes"
     )
-    elevation_model: str = Field("", description="heights of the ground: a GeoTIFF, an .asc or an .npz; empty: none")
+    elevation_model: str = Field("", description="heights of the ground: a GeoTIFF or an .asc; empty: none")
     elevation_sigma_m: float = Field(0.5, gt=0, description="standard deviation of its heights, m")
     elevation_start: str = Field(
         "", description="x and y (m) and heading (deg) of the first pose in the elevation model; empty: by GNSS"

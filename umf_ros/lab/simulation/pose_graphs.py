@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -256,6 +257,12 @@ class AbsoluteWorld:
     heights: Array
     corner: tuple[float, float]
     cell_m: float
+
+    def write_heights(self, path: Path) -> None:
+        """Write the elevation model as an ESRI ASCII grid, .asc."""
+        (height, width), (x, y) = self.heights.shape, self.corner
+        head = f"ncols {width}\nnrows {height}\nxllcenter {x}\nyllcenter {y}\ncellsize {self.cell_m}"
+        np.savetxt(path, self.heights[::-1], header=f"{head}\nnodata_value -9999", comments="")
 
 
 ANTENNA = np.array([-0.3, 0.25, 1.1])
