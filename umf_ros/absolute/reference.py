@@ -264,7 +264,9 @@ class AbsoluteReference:
                 path = replace(path, poses=self.worlds[component] @ path.poses)
             track.judge(measured, path, known)
             if track.factors and not known:
-                self.worlds[component] = _upright(apply(path.poses, measured).mean(axis=0))
+                # upright, along the shortest arc
+                turn, _ = Rotation.align_vectors([0.0, 0.0, 1.0], apply(path.poses, measured).mean(axis=0))
+                self.worlds[component] = make_pose(turn.as_matrix(), np.zeros(3))
             changed = changed or before != {cell: factor.numbers for cell, factor in track.factors.items()}
         return changed
 
@@ -422,8 +424,3 @@ def _first_pose_noise(pose: Array, sources: set[Aid]) -> gtsam.noiseModel.Base:
     axes = np.kron(np.eye(2), pose[:3, :3].T)  # from world axes to body axes
     covariance = axes @ np.diag(np.square([tilt, tilt, turn, across, across, up])) @ axes.T
     return gtsam.noiseModel.Gaussian.Covariance(0.5 * (covariance + covariance.T))
-
-
-def _upright(up: Array) -> Array:
-    """Return the rotation (4, 4) of a direction to the vertical along the shortest arc."""
-    return make_pose(Rotation.align_vectors([0.0, 0.0, 1.0], up)[0].as_matrix(), np.zeros(3))

@@ -71,12 +71,9 @@ def settings_for(bag: Bag, config: Path | None, dataset: str, **overrides: Any) 
     try:
         found = detect_dataset(bag, own_calibration=bool(settings.calibration))
     except BagError as error:
-        return _found_by_type(bag, settings, str(error))
+        if not settings.calibration and TRANSFORMS_TOPIC not in bag.topics:
+            advice = f"the parameter calibration names a file, and umf inspect {bag.path} --write . writes a first one"
+            text = f"{error}, and without {TRANSFORMS_TOPIC} its sensors are anywhere; {advice}"
+            raise BagError(text) from None
+        return with_topics(settings, bag.types)
     return settings.model_copy(update={"dataset": found})
-
-
-def _found_by_type(bag: Bag, settings: Settings, reason: str) -> Settings:
-    if not settings.calibration and TRANSFORMS_TOPIC not in bag.topics:
-        advice = f"the parameter calibration names a file, and umf inspect {bag.path} --write . writes a first one"
-        raise BagError(f"{reason}, and without {TRANSFORMS_TOPIC} its sensors are anywhere; {advice}")
-    return with_topics(settings, bag.types)

@@ -161,18 +161,13 @@ def ros_to_gtsam_covariance(covariance: ArrayLike, pose: Array) -> Array:
     """
     turn = np.kron(np.eye(2), pose[:3, :3].T)
     in_child = turn @ np.asarray(covariance, dtype=float).reshape(6, 6) @ turn.T
-    return _swap_blocks(in_child)
+    return np.roll(in_child, 3, axis=(0, 1))  # swaps the blocks
 
 
 def gtsam_to_ros_covariance(covariance: ArrayLike, pose: Array) -> Array:
     """Return the inverse of `ros_to_gtsam_covariance`: (6, 6) in ROS order about the parent axes."""
     turn = np.kron(np.eye(2), pose[:3, :3])
-    return turn @ _swap_blocks(np.asarray(covariance, dtype=float).reshape(6, 6)) @ turn.T
-
-
-def _swap_blocks(matrix: Array) -> Array:
-    order = [3, 4, 5, 0, 1, 2]
-    return matrix[np.ix_(order, order)]
+    return turn @ np.roll(np.asarray(covariance, dtype=float).reshape(6, 6), 3, axis=(0, 1)) @ turn.T
 
 
 def evenly(count: int, most: int) -> NDArray[np.intp]:

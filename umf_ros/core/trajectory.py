@@ -130,7 +130,6 @@ def write_geojson(path: Path, trajectories: Mapping[str, Array], world_T_map: Ar
 
 EDGE = np.dtype([("first", "i8"), ("second", "i8"), ("pose", "f8", (4, 4)), ("covariance", "f8", (6, 6))])
 """Fields of an array of edges: pose `first_T_second`, covariance in GTSAM's order, tangent space of `second`."""
-_ROTATION_LAST = np.array([3, 4, 5, 0, 1, 2])
 
 
 def write_g2o(path: Path, poses: Array, edges: ArrayLike, ids: Sequence[int] | None = None) -> None:
@@ -148,7 +147,7 @@ def write_g2o(path: Path, poses: Array, edges: ArrayLike, ids: Sequence[int] | N
     names = range(len(poses)) if ids is None else ids
     measured = np.asarray(edges, EDGE)
     pairs = [(names[first], names[second]) for first, second in measured[["first", "second"]].tolist()]
-    information = np.linalg.inv(measured["covariance"][:, _ROTATION_LAST[:, None], _ROTATION_LAST])
+    information = np.linalg.inv(np.roll(measured["covariance"], 3, axis=(1, 2)))  # position first
     upper = np.triu_indices(6)
     numbers = np.concatenate([_numbers(measured["pose"]), information[:, upper[0], upper[1]]], axis=1)
     lines = g2o_lines("VERTEX_SE3:QUAT", [(name,) for name in names], _numbers(poses))

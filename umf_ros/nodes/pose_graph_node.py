@@ -291,7 +291,8 @@ class PoseGraphNode(BaseNode):
 
     def _reset(self) -> str:
         if self._results:
-            self._durable.write_results(_numbered(Path(self._results)))
+            parent = Path(self._results)
+            self._durable.write_results(next(new for i in count(1) if not (new := parent / f"graph_{i}").exists()))
         kept = self._durable.end()
         self._state, self._drawn_ns = self._durable.state(), None
         return "a new graph begins" + (f"; the old one is kept in {kept}" if kept else "")
@@ -301,11 +302,6 @@ def describe(verdict: ClosureVerdict) -> str:
     """Return one line about a verdict for the log."""
     seconds = (verdict.closure.query_stamp_ns - verdict.closure.match_stamp_ns) * 1e-9
     return f"graph: closure {seconds:.1f} s back {verdict.state.value}: {verdict.reason}{verdict.figures}"
-
-
-def _numbered(results: Path) -> Path:
-    """Return a new folder for the results of an ended graph."""
-    return next(folder for i in count(1) if not (folder := results / f"graph_{i}").exists())
 
 
 def _as_status(verdict: ClosureVerdict) -> DiagnosticStatus:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from umf_ros.core.config import TerrainSettings
-from umf_ros.core.errors import ConfigError
 from umf_ros.core.geometry import Array, transform
 from umf_ros.core.io import atomic_write, write_atomically
 
@@ -28,7 +27,7 @@ NEAR = 0.8
 # shades of map_server: unknown and near the limits lie between its thresholds
 _SHADES = {FREE: 254, OBSTACLE: 0}
 _GREY = 205
-_YAML = """image: {image}
+_YAML = """image: map.pgm
 mode: trinary
 resolution: {cell_m}
 origin: [{x:.6f}, {y:.6f}, 0.0]
@@ -121,15 +120,10 @@ def write_terrain(folder: Path, points: Array, settings: TerrainSettings, world:
         return ""
     grid = make_grid(points, settings)
     write_grid(folder, grid)
-    try:
-        if world is None:
-            write_elevation(folder / "elevation.tif", grid)
-        else:
-            world_T_map, origin = world
-            write_elevation(folder / "elevation.tif", make_grid(transform(world_T_map, points), settings), origin)
-    except ConfigError as error:
-        return str(error)
-    return ""
+    if world is None:
+        return write_elevation(folder / "elevation.tif", grid)
+    world_T_map, origin = world
+    return write_elevation(folder / "elevation.tif", make_grid(transform(world_T_map, points), settings), origin)
 
 
 def write_grid(folder: Path, grid: TerrainGrid) -> None:
@@ -145,23 +139,22 @@ def write_grid(folder: Path, grid: TerrainGrid) -> None:
     with atomic_write(folder / "map.pgm") as part:  # the first row is the one with the largest y
         part.write_bytes(f"P5\n{width} {height}\n255\n".encode("ascii") + shades[::-1].tobytes())
     x, y = grid.lower
-    write_atomically(folder / "map.yaml", _YAML.format(image="map.pgm", cell_m=grid.cell_m, x=x, y=y))
+    write_atomically(folder / "map.yaml", _YAML.format(cell_m=grid.cell_m, x=x, y=y))
 
 
-def write_elevation(path: Path, grid: TerrainGrid, origin: Array | None = None) -> None:
-    """Write the heights of a grid as a GeoTIFF, north up.
+def write_elevation(path: Path, grid: TerrainGrid, origin: Array | None = None) -> str:
+    """Write the heights of a grid as a GeoTIFF, north up; without rasterio, return so as a sentence.
 
     The axes of the grid are east, north and up of the origin (3,): latitude, longitude (deg) and height (m) on WGS 84.
     Without one, they are any, and the file has no geographic reference.
 
     Raises:
-        ConfigError: rasterio is not installed.
         OutputError: the file cannot be written.
     """
     try:
         import rasterio
     except ImportError:
-        raise ConfigError(f"no {path.name}: rasterio is not installed (pip install umf_ros[elevation])") from None
+        return f"no {path.name}: rasterio is not installed (pip install umf_ros[elevation])"
     height, width = grid.cells.shape
     top = grid.lower[1] + height * grid.cell_m
     to_world = rasterio.Affine(grid.cell_m, 0.0, grid.lower[0], 0.0, -grid.cell_m, top)
@@ -177,3 +170,4 @@ def write_elevation(path: Path, grid: TerrainGrid, origin: Array | None = None) 
         rasterio.open(part, "w", width=width, height=height, crs=crs, transform=to_world, **layout) as file,
     ):
         file.write(grid.heights[::-1] + level, 1)
+    return ""
