@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,9 +19,6 @@ if TYPE_CHECKING:
 
 # a shell that starts the tests in the background has them ignore Ctrl-C, which some of them press
 signal.signal(signal.SIGINT, signal.default_int_handler)
-# real DDS, on this machine alone and in a domain of its own
-os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 # the same examples in every run, whatever the load of the machine
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")

@@ -13,6 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
 
+# real DDS, on this machine alone and in a domain of its own
+os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 ENVIRONMENT = {
     **os.environ,
     "RCUTILS_LOGGING_USE_STDOUT": "1",
