@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Embedding, Keyframe
 from umf_ros.core.geometry import Array, make_pose
 from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA
+from umf_ros.submaps.history import submap_around
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import known_only
@@ -132,6 +134,45 @@ def test_a_scan_of_a_single_ring_has_no_planes_and_no_rival() -> None:
     one = PreparedScan(around[np.isfinite(around).all(axis=1)].astype(np.float32))
     assert not any(planes.planar.any() for planes in one.surfaces)
     assert locate_along(one, one, shift(0.0)) is None
+
+
+def submap(around: Callable[[float, int], PreparedScan], x: float, number: int) -> Keyframe:
+    """Scans taken every 1.7 m along a passage, merged around one of them."""
+    rng = np.random.default_rng(number)
+    keyframes = []
+    for step in range(-7, 8):
+        along = x + 1.7 * step + 0.05 * rng.standard_normal()
+        points = around(along, 100 * number + step).points.astype(np.float32)
+        pose = make_pose(np.eye(3), [along, 0.0, 0.0])
+        embedding, stamp_ns = Embedding(np.ones(4, np.float32)), 10**9 * (100 * number + step)
+        known = {"odom_T_body": pose, "path_length_m": 50 + along, "session": number}
+        keyframes.append(Keyframe(stamp_ns, embedding, CAMERA, BODY_T_CAMERA, points, **known))
+    centre = keyframes.pop(7)
+    merged = submap_around(centre, keyframes)
+    assert merged is not None
+    return merged
+
+
+SUBMAPS: dict[str, Callable[[float, int], PreparedScan]] = {
+    "corridor": lambda x, seed: corridor(x, 1000 + seed),
+    "tunnel": lambda _, seed: scan(vault_ranges(rays(), 2.0), 1000 + seed),
+    "doors": lambda x, seed: corridor(x, 1000 + seed, tuple(np.arange(-37.5, 38.0, 3.0)), 0.06),
+}
+
+
+@pytest.mark.parametrize("name", SUBMAPS)
+def test_the_pattern_of_scans_merged_at_equal_distances_is_no_evidence(name: str) -> None:
+    match, query = submap(SUBMAPS[name], 0.0, 1), submap(SUBMAPS[name], 5.0, 2)
+    verdict = Verifier(Verification()).verify(query, [(Candidate(0, match.stamp_ns, 0.9), match)])[0]
+    assert verdict.measurements["merged"] > 5 and verdict.measurements["lead"] < 1.0 and not verdict.accepted
+
+
+def test_points_of_different_places_tell_where_submaps_in_a_corridor_were_made() -> None:
+    around = lambda x, seed: corridor(x, 1000 + seed, UNEVEN, 0.3)  # noqa: E731
+    match, query = (PreparedScan.of(submap(around, x, number)) for x, number in ((0.0, 1), (2.4, 2)))
+    for metres, right in ((2.4, True), (0.6, False)):
+        information = align_scans(match, query, shift(metres)).information
+        assert (ambiguity(match, query, shift(metres), information)["lead"] > 1.0) == right
 
 
 def test_a_passage_is_found_in_its_direction_and_a_room_is_none() -> None:

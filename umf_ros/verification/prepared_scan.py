@@ -84,7 +84,13 @@ class Surfaces:
 
 
 class PreparedScan:
-    """A keyframe's scan made ready for comparison, each part when it is first asked for."""
+    """A keyframe's scan made ready for comparison, each part when it is first asked for.
+
+    Attributes:
+        points: (M, 3) m, body frame.
+        blur_m: how far points may be off because the LiDAR moved during the scan, standard deviation.
+        owner: (M,) the merged scan of each point, 0 to K - 1.
+    """
 
     def __init__(
         self, points: Points, body_T_lidar: Array | None = None, blur_m: float = 0.0, owner: Indices | None = None
@@ -100,7 +106,7 @@ class PreparedScan:
         self.points: Array = points.astype(float)
         self.blur_m = blur_m
         self._lidars_T_body = invert(np.eye(4)[None] if body_T_lidar is None else body_T_lidar.reshape(-1, 4, 4))
-        self._owner = np.zeros(len(points), np.intp) if owner is None else owner
+        self.owner = np.zeros(len(points), np.intp) if owner is None else owner
         self._maps: dict[float, GridMap] = {}
 
     @classmethod
@@ -118,12 +124,18 @@ class PreparedScan:
         return len(self._lidars_T_body)
 
     @cached_property
+    def lidars(self) -> Array:
+        """(K, 3) m: where the merged scans were taken."""
+        places: Array = invert(self._lidars_T_body)[:, :3, 3]
+        return places
+
+    @cached_property
     def narrow(self) -> bool:
         """Whether it was merged from scans that see little around the sensor."""
         if self.merged == 1:
             return False
-        number = int(np.bincount(self._owner).argmax())
-        own = transform(self._lidars_T_body[number], self.points[self._owner == number])
+        number = int(np.bincount(self.owner).argmax())
+        own = transform(self._lidars_T_body[number], self.points[self.owner == number])
         return FieldOfView(own).width_deg < const.NARROW_DEG
 
     def make_ready(self) -> None:
@@ -191,7 +203,7 @@ class PreparedScan:
     def range_images(self) -> list[RangeImage]:
         """How far the LiDAR saw from where each of the merged scans was taken."""
         return [
-            RangeImage(transform(lidar_T_body, self.points[self._owner == number]))
+            RangeImage(transform(lidar_T_body, self.points[self.owner == number]))
             for number, lidar_T_body in enumerate(self._lidars_T_body)
         ]
 
@@ -269,7 +281,7 @@ class PreparedScan:
     @cached_property
     def surfaces(self) -> tuple[Surfaces, Surfaces]:
         """Planes through the points of every second band of elevations, and through those between."""
-        poses = self._lidars_T_body[self._owner]
+        poses = self._lidars_T_body[self.owner]
         seen = np.einsum("nij,nj->ni", poses[:, :3, :3], self.points) + poses[:, :3, 3]
         elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
         odd = (np.floor(elevation / const.SIGHT_DEG) % 2).astype(bool)

@@ -5,6 +5,9 @@ lies on its floor, walls and ceiling in the same way wherever it stands. Points 
 identity pose although the places differ, and an alignment of points that begins near it stays there. In a passage all
 positions along it are therefore compared, and a point's distance is that to a plane of the other scan. Points of one
 half of a scan, every second band of elevations, are compared with planes of the other half alone: no ring meets itself.
+
+The planes of submaps are blurred by odometry. Where these do not tell, points may, but only those of scans that were
+taken at different places: they have no pattern in common.
 """
 
 from __future__ import annotations
@@ -78,8 +81,8 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
 
     - `rival_near`: half a metre on, along the direction in which the position is known least;
     - `rival_far`: at the best pose 1 to 6 m on, and at the other peaks of the search at the same heading;
-    - `lead`: the latter as a share of what a closure needs. Near the identity, where the patterns of two single scans
-      lie on each other wherever these were taken, that is more. Unknown in the open, where terrain decides.
+    - `lead`: the latter as a share of what a closure needs. Near the identity, where the pattern of one sensor lies on
+      itself wherever the scans were taken, that is more. Unknown in the open, where terrain decides.
 
     0 when another pose fits as well. In a passage, where points follow the sensor's pattern, `locate_along` decides.
 
@@ -99,9 +102,13 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     found = {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
     if not structured(match, query):
         return found
-    single = match.merged == query.merged == 1
-    needed = const.PATTERN_LEAD if single and _near_identity(pose) else const.MIN_LEAD
+    needed = const.PATTERN_LEAD if patterned(match, query) and _near_identity(pose) else const.MIN_LEAD
     return found | {"lead": found["rival_far"] / needed}
+
+
+def patterned(match: PreparedScan, query: PreparedScan) -> bool:
+    """Whether the pattern of a sensor may lie in both scans in the same way; points of two submaps can avoid it."""
+    return min(match.merged, query.merged) == 1
 
 
 def _near_identity(pose: Array) -> bool:
@@ -112,9 +119,24 @@ def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Arra
     """(K,) mean misfit with a scan of the other's visible points at poses (K, 4, 4); the worst where few are."""
     points = at_poses(poses, other.scouts)
     reach = np.tile(counterpart_reach(other.spacing[:: const.SCOUT_EVERY], common_blur(scan, other)), len(poses))
-    misfit = np.minimum(np.sqrt(scan.nearest(points)[1]) / reach, const.RIVAL_MISFIT)
-    seen = visible(scan.look_at(points)).reshape(len(poses), -1)
+    away = np.sqrt(scan.nearest(points)[1] if patterned(scan, other) else _squared(scan, other, poses, points))
+    misfit = np.minimum(away / reach, const.RIVAL_MISFIT)
+    seen = (visible(scan.look_at(points)) & np.isfinite(away)).reshape(len(poses), -1)
     return mean_misfits(misfit.reshape(seen.shape), seen, const.FEWEST_POINTS, const.RIVAL_MISFIT)
+
+
+def _squared(submap: PreparedScan, other: PreparedScan, poses: Array, points: Array) -> Array:
+    """(K * N,) m^2: squared distances of points to those nearest that were not seen from the same place, or infinite.
+
+    Scans that were taken at the same place have the pattern of the sensor in common.
+    """
+    places = at_poses(poses, other.lidars).reshape(len(poses), -1, 1, 3)
+    apart = np.linalg.norm(places - submap.lidars, axis=3) > const.MAX_BLUR_M
+    index, squared = submap.tree.batch_knn_search(points, const.NEIGHBOURS, 1)
+    theirs = submap.owner[np.asarray(index, np.intp)].reshape(len(poses), -1, const.NEIGHBOURS)
+    ours = other.owner[other.picks[:: const.SCOUT_EVERY]]
+    known = apart[np.arange(len(poses))[:, None, None], ours[None, :, None], theirs]
+    return np.where(known.reshape(len(points), -1), np.asarray(squared), np.inf).min(axis=1)
 
 
 def mean_misfits(misfits: Array, known: Mask, fewest: float, otherwise: float) -> Array:

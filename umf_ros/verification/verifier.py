@@ -26,7 +26,7 @@ from umf_ros.verification.pose_search import (
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans, inspect
-from umf_ros.verification.scan_consistency import ambiguity, locate_along
+from umf_ros.verification.scan_consistency import ambiguity, locate_along, patterned
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 
@@ -173,11 +173,14 @@ class Verifier:
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
     def _look_elsewhere(self, hypothesis: Hypothesis) -> None:
-        """Compare with other poses; in a passage, move to the best position along it."""
+        """Compare with other poses; in a passage, move to the best position along it.
+
+        Points of two submaps may tell where the planes of a passage do not.
+        """
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
         found = locate_along(theirs, ours, hypothesis.pose)
-        if found is None:
+        if found is None or (found.lead < 1.0 and not patterned(theirs, ours)):
             hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
             return
         hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
