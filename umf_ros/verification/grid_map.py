@@ -112,15 +112,29 @@ def terrain_fit(match: GridMap, query: GridMap, pose: Array) -> tuple[float, flo
     Returns:
         Correlation, -1 to 1; the same in standard deviations of chance; standard deviation of the match's relief, m.
     """
-    ours = query.known_relief
-    theirs = match.look_up(match.relief, transform(pose, query.cells))
-    shared = np.isfinite(theirs) & np.isfinite(ours)
-    ours, theirs = ours[shared].astype(float), theirs[shared]
+    ours, theirs = _shared_relief(match, query, pose)
     if len(ours) < const.FEWEST_POINTS:
         return 0.0, 0.0, float(theirs.std()) if len(theirs) else 0.0
     norm = float(np.sqrt((ours**2).sum() * (theirs**2).sum()))
     correlation = float((ours * theirs).sum()) / max(norm, 1e-9)
     return correlation, correlation * math.sqrt(len(ours)), float(theirs.std())
+
+
+def relief_agreement(match: GridMap, query: GridMap, pose: Array) -> float:
+    """How much more often two maps agree than differ about what is high and what is low, -1 to 1; as `terrain_fit`.
+
+    All cells count alike, so a few rocks do not outvote the ground they lie on.
+    """
+    ours, theirs = _shared_relief(match, query, pose)
+    return float(np.sign(ours * theirs).mean()) if len(ours) >= const.FEWEST_POINTS else 0.0
+
+
+def _shared_relief(match: GridMap, query: GridMap, pose: Array) -> tuple[Array, Array]:
+    """Relief (S,) of the query's cells, and of the match under them, where both are known, m."""
+    ours = query.known_relief
+    theirs = match.look_up(match.relief, transform(pose, query.cells))
+    shared = np.isfinite(theirs) & np.isfinite(ours)
+    return ours[shared].astype(float), theirs[shared]
 
 
 def relief_of(height: Array, known: NDArray[np.bool_], cell_m: float) -> Grid:

@@ -6,8 +6,8 @@ identity pose although the places differ, and an alignment of points that begins
 positions along it are therefore compared, and a point's distance is that to a plane of the other scan. Points of one
 half of a scan, every second band of elevations, are compared with planes of the other half alone: no ring meets itself.
 
-The planes of submaps are blurred by odometry. Where these do not tell, points may, but only those of scans that were
-taken at different places: they have no pattern in common.
+The planes of submaps are blurred by odometry, but their points can avoid the pattern: only those of scans that were
+taken at different places are compared. Where next to nothing stands, positions are told by the relief of the ground.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from umf_ros.core.geometry import Array, evenly, invert, near, transform
 from umf_ros.verification import constants as const
+from umf_ros.verification.grid_map import relief_agreement
 from umf_ros.verification.pose_search import alternatives
-from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur, structured
+from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur, levelled, structured
 from umf_ros.verification.scan_alignment import SEARCHED, run_gicp
 from umf_ros.verification.visibility import Sight, visible
 
@@ -77,12 +78,14 @@ def _share(what: Mask, of: Mask, otherwise: float) -> float:
 
 
 def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> dict[str, float]:
-    """Return how much worse the points of two scans fit at other poses, as logarithms of the ratio of the mean misfits.
+    """Return how much worse two scans fit at other poses, as logarithms of the ratio of their misfits.
+
+    The misfit is the mean of points; where next to nothing stands, it is how far relief is from full agreement.
 
     - `rival_near`: half a metre on, along the direction in which the position is known least;
     - `rival_far`: at the best pose 1 to 6 m on, and at the other peaks of the search at the same heading;
     - `lead`: the latter as a share of what a closure needs. Near the identity, where the pattern of one sensor lies on
-      itself wherever the scans were taken, that is more. Unknown in the open, where terrain decides.
+      itself wherever the scans were taken, that is more; likewise for single scans where next to nothing stands.
 
     0 when another pose fits as well. In a passage, where points follow the sensor's pattern, `locate_along` decides.
 
@@ -97,12 +100,17 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     beside, along = (shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
     peaks = [one for one in alternatives(match, query, pose) if not near(one, pose, const.DISTINCT_M, np.pi / 2)]
     poses = np.stack([pose, *beside, *along, *peaks])
-    misfits = _point_misfit(match, query, poses), _point_misfit(query, match, invert(poses))
-    fit, far = np.log(np.maximum(sum(misfits) / 2, const.MISFIT_FLOOR)), 1 + len(beside)
+    stands, pattern = structured(match, query), patterned(match, query)
+    if stands:
+        misfits = (_point_misfit(match, query, poses) + _point_misfit(query, match, invert(poses))) / 2
+    else:
+        level = [levelled(match, query, one) for one in poses]
+        misfits = np.array([1.0 - relief_agreement(match.terrain, query.terrain, one) for one in level])
+    fit, far = np.log(np.maximum(misfits, const.MISFIT_FLOOR)), 1 + len(beside)
     found = {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
-    if not structured(match, query):
-        return found
-    needed = const.PATTERN_LEAD if patterned(match, query) and _near_identity(pose) else const.MIN_LEAD
+    needed = const.MIN_LEAD
+    if pattern and (not stands or _near_identity(pose)):
+        needed = const.PATTERN_LEAD if stands else const.OPEN_LEAD
     return found | {"lead": found["rival_far"] / needed}
 
 

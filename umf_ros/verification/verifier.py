@@ -173,14 +173,11 @@ class Verifier:
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
     def _look_elsewhere(self, hypothesis: Hypothesis) -> None:
-        """Compare with other poses; in a passage, move to the best position along it.
-
-        Points of two submaps may tell where the planes of a passage do not.
-        """
+        """Compare with other poses; of scans in a passage, move to the best position along it."""
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
-        found = locate_along(theirs, ours, hypothesis.pose)
-        if found is None or (found.lead < 1.0 and not patterned(theirs, ours)):
+        found = locate_along(theirs, ours, hypothesis.pose) if patterned(theirs, ours) else None
+        if found is None:
             hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
             return
         hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
