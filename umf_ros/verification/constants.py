@@ -94,8 +94,6 @@ RIVAL_MISFIT, MISFIT_FLOOR = 3.0, 0.05  # by hand: the worst misfit, in counterp
 # log of a ratio of misfits. measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 86. Near
 # the identity: a wrong pose in a greenhouse had .15, and of 900 right poses with it all but 8 had more than this
 MIN_LEAD, PATTERN_LEAD = 0.1, 0.2
-# measured: 3 to 10 in 100 right poses in the open have less; of 40 wrong ones that fit by eight rocks, one has .36
-OPEN_LEAD = 0.4
 PATTERN_M = 1.3  # measured on validation passages: so near the identity lie wrong poses that follow the pattern
 
 # passages: corridors, tunnels, aisles, canyons, where a scan looks the same all along

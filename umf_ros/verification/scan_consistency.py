@@ -85,7 +85,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     - `rival_near`: half a metre on, along the direction in which the position is known least;
     - `rival_far`: at the best pose 1 to 6 m on, and at the other peaks of the search at the same heading;
     - `lead`: the latter as a share of what a closure needs. Near the identity, where the pattern of one sensor lies on
-      itself wherever the scans were taken, that is more; likewise for single scans where next to nothing stands.
+      itself wherever the scans were taken, that is more. Unknown where next to nothing stands.
 
     0 when another pose fits as well. In a passage, where points follow the sensor's pattern, `locate_along` decides.
 
@@ -100,7 +100,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     beside, along = (shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
     peaks = [one for one in alternatives(match, query, pose) if not near(one, pose, const.DISTINCT_M, np.pi / 2)]
     poses = np.stack([pose, *beside, *along, *peaks])
-    stands, pattern = structured(match, query), patterned(match, query)
+    stands = structured(match, query)
     if stands:
         misfits = (_point_misfit(match, query, poses) + _point_misfit(query, match, invert(poses))) / 2
     else:
@@ -108,9 +108,9 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
         misfits = np.array([1.0 - relief_agreement(match.terrain, query.terrain, one) for one in level])
     fit, far = np.log(np.maximum(misfits, const.MISFIT_FLOOR)), 1 + len(beside)
     found = {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
-    needed = const.MIN_LEAD
-    if pattern and (not stands or _near_identity(pose)):
-        needed = const.PATTERN_LEAD if stands else const.OPEN_LEAD
+    if not stands:
+        return found
+    needed = const.PATTERN_LEAD if patterned(match, query) and _near_identity(pose) else const.MIN_LEAD
     return found | {"lead": found["rival_far"] / needed}
 
 
