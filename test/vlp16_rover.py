@@ -46,8 +46,8 @@ class Vlp16Rover(Node):
 
         assert wait_until(is_heard, 60.0, self.spin), [process.output for process in processes]
 
-    def drive(self, seconds: float, start_s: int = 1_700_000_000) -> None:
-        """Scans of sixteen rings, images and odometry at 5 Hz, driving ahead at 1 m/s."""
+    def drive(self, seconds: float, start_s: int = 1_700_000_000, pause_s: float = 0.05) -> None:
+        """Scans of sixteen rings, images and odometry at 5 Hz, driving ahead at 1 m/s; in real time with .2 s."""
         for step in range(int(5 * seconds)):
             stamp = to_time(start_s * 10**9 + step * 200_000_000)
             odometry = Odometry(child_frame_id="base_link")
@@ -64,7 +64,7 @@ class Vlp16Rover(Node):
             self.clouds.publish(self._scan(stamp))
             for publisher in self.images:
                 publisher.publish(image)
-            wait_until(lambda: False, 0.05, self.spin)
+            wait_until(lambda: False, pause_s, self.spin)
 
     def _scan(self, stamp: object) -> PointCloud2:
         azimuth, ring = np.meshgrid(np.arange(0, 2 * np.pi, 0.05), np.deg2rad(np.arange(-15, 16, 2)))

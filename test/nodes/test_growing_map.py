@@ -27,22 +27,22 @@ def test_what_is_seen_while_localising_becomes_a_session_at_save_and_at_the_end(
     second: Process | None = None
     try:
         rig.until_heard(first)
-        rig.drive(5.0)
+        rig.drive(5.0, pause_s=0.2)
         assert first.interrupt() == 0, first.output
         target = MapFolder.open_or_create(tmp_path / "map", Settings())
         session, _ = grow(target.path, before)
-        assert session is not None and session.places >= 1
+        assert session is not None and session.places >= 4
 
         second = Process(MODULE, tmp_path / "second.log", *common, *localising, f"results_dir:={after}")
         rig.until_heard(second)
-        rig.drive(5.0, start_s=1_700_001_000)
+        rig.drive(5.0, 1_700_001_000, pause_s=0.2)  # no keyframe is dropped
         client = rig.create_client(Trigger, "/loop_closure_node/save")
         assert client.wait_for_service(20.0)
         future = client.call_async(Trigger.Request())
         assert wait_until(future.done, 60.0, rig.spin)
         assert future.result().success and "sessions" in future.result().message, future.result().message
         saved = MapFolder.open(target.path).sessions
-        assert len(saved) == 2 and saved[1].places >= 1  # a busy machine drops keyframes
+        assert len(saved) == 2 and saved[1].places >= 4
         rig.drive(5.0, start_s=1_700_001_006)
         assert second.interrupt() == 0, second.output
         sessions = MapFolder.open(target.path).sessions

@@ -94,6 +94,9 @@ RIVAL_MISFIT, MISFIT_FLOOR = 3.0, 0.05  # by hand: the worst misfit, in counterp
 # log of a ratio of misfits. measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 86. Near
 # the identity: a wrong pose in a greenhouse had .15, and of 900 right poses with it all but 8 had more than this
 MIN_LEAD, PATTERN_LEAD = 0.1, 0.2
+SAME_PLACE_OF_SCANS_M = (
+    0.3  # by hand: scans this near each other share the pattern; .2 and .4 refuse the same corridors
+)
 PATTERN_M = 1.3  # measured on validation passages: so near the identity lie wrong poses that follow the pattern
 
 # passages: corridors, tunnels, aisles, canyons, where a scan looks the same all along
@@ -129,7 +132,7 @@ SUBMAP_UNEXPLAINED = 0.1
 MERGE_STEP_M = 1.5  # measured: between the scans that are merged; 1 and 2 m are as good
 ENOUGH_SEEN, MOST_SEEN = 0.6, 0.85  # of what all these scans show nearby: one scan is enough, and where merging stops
 MERGED_POINTS = 12_000  # measured: 8,000 find less, 16,000 hardly more
-MAX_BLUR_M = 0.3  # by hand: half a cell of the maps: standard deviation by which a merged point or scan may be off
+MAX_BLUR_M = 0.3  # by hand: half a cell of the maps: standard deviation by which a merged point may be off
 PROMISING = 0.05  # by hand: probability of a scan's hypothesis from which on submaps are compared
 DRIFT_KNOWN, DRIFT_STEPS = 3, 24  # by hand: scans that the drift of odometry is judged by, at least and at most
 ODOMETRY_ALONE_M = 80.0  # by hand: path over which odometry without a closure is worth a look

@@ -120,13 +120,17 @@ def terrain_fit(match: GridMap, query: GridMap, pose: Array) -> tuple[float, flo
     return correlation, correlation * math.sqrt(len(ours)), float(theirs.std())
 
 
-def relief_agreement(match: GridMap, query: GridMap, pose: Array) -> float:
-    """How much more often two maps agree than differ about what is high and what is low, -1 to 1; as `terrain_fit`.
+def relief_misfit(match: GridMap, query: GridMap, pose: Array) -> float:
+    """How much of the relief of two maps the other does not explain at a pose, 0 to 1; arguments as of `terrain_fit`.
 
-    All cells count alike, so a few rocks do not outvote the ground they lie on.
+    The standard deviation that is left, as a share, by the correlation that the signs of the relief have (arcsine law).
+    Signs count every cell alike, so the relief of a few rocks does not hide that of the ground.
     """
     ours, theirs = _shared_relief(match, query, pose)
-    return float(np.sign(ours * theirs).mean()) if len(ours) >= const.FEWEST_POINTS else 0.0
+    if len(ours) < const.FEWEST_POINTS:
+        return 1.0
+    correlation = math.sin(math.pi / 2 * float(np.sign(ours * theirs).mean()))
+    return math.sqrt(1.0 - max(correlation, 0.0) ** 2)
 
 
 def _shared_relief(match: GridMap, query: GridMap, pose: Array) -> tuple[Array, Array]:

@@ -46,9 +46,10 @@ MEASUREMENTS = {
     "counterparts": "share of these that have a counterpart",
     "upright_counterparts": "of walls, trunks and rocks that should be seen, the share with a counterpart",
     "unexplained": "of the same, the share that is far from everything, the larger of both",
-    "rival_near": "logarithm of how much worse the points fit half a metre on; unknown for improbable hypotheses",
+    "rival_near": "logarithm of how much worse points, or the relief of open ground, fit half a metre on; unknown for "
+    "improbable hypotheses",
     "rival_far": "the same of the best fit 1 to 6 m on; 0 when another pose fits as well",
-    "lead": "how much worse points, or in a passage surfaces, fit elsewhere; a closure needs 1",
+    "lead": "how much worse points, or surfaces of scans in a passage, fit elsewhere; a closure needs 1",
     "runner_up": "logarithm of how much more is missing at the next best hypothesis about the pair",
     "pose_inliers": "feature pairs that agree with the pose",
     "residual_sigmas": "errors of reprojection in standard deviations of the features' noise",

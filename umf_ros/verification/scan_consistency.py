@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.geometry import Array, evenly, invert, near, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.grid_map import relief_agreement
+from umf_ros.verification.grid_map import relief_misfit
 from umf_ros.verification.pose_search import alternatives
 from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur, levelled, structured
 from umf_ros.verification.scan_alignment import SEARCHED, run_gicp
@@ -80,7 +80,7 @@ def _share(what: Mask, of: Mask, otherwise: float) -> float:
 def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> dict[str, float]:
     """Return how much worse two scans fit at other poses, as logarithms of the ratio of their misfits.
 
-    The misfit is the mean of points; where next to nothing stands, it is how far relief is from full agreement.
+    The misfit is the mean of points; where next to nothing stands, the share of relief that is not explained.
 
     - `rival_near`: half a metre on, along the direction in which the position is known least;
     - `rival_far`: at the best pose 1 to 6 m on, and at the other peaks of the search at the same heading;
@@ -105,7 +105,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
         misfits = (_point_misfit(match, query, poses) + _point_misfit(query, match, invert(poses))) / 2
     else:
         level = [levelled(match, query, one) for one in poses]
-        misfits = np.array([1.0 - relief_agreement(match.terrain, query.terrain, one) for one in level])
+        misfits = np.array([relief_misfit(match.terrain, query.terrain, one) for one in level])
     fit, far = np.log(np.maximum(misfits, const.MISFIT_FLOOR)), 1 + len(beside)
     found = {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
     if not stands:
@@ -127,19 +127,25 @@ def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Arra
     """(K,) mean misfit with a scan of the other's visible points at poses (K, 4, 4); the worst where few are."""
     points = at_poses(poses, other.scouts)
     reach = np.tile(counterpart_reach(other.spacing[:: const.SCOUT_EVERY], common_blur(scan, other)), len(poses))
-    away = np.sqrt(scan.nearest(points)[1] if patterned(scan, other) else _squared(scan, other, poses, points))
+    away = np.sqrt(
+        scan.nearest(points)[1] if patterned(scan, other) else _nearest_of_others(scan, other, poses, points)
+    )
     misfit = np.minimum(away / reach, const.RIVAL_MISFIT)
     seen = (visible(scan.look_at(points)) & np.isfinite(away)).reshape(len(poses), -1)
     return mean_misfits(misfit.reshape(seen.shape), seen, const.FEWEST_POINTS, const.RIVAL_MISFIT)
 
 
-def _squared(submap: PreparedScan, other: PreparedScan, poses: Array, points: Array) -> Array:
-    """(K * N,) m^2: squared distances of points to those nearest that were not seen from the same place, or infinite.
+def _nearest_of_others(submap: PreparedScan, other: PreparedScan, poses: Array, points: Array) -> Array:
+    """(K * N,) m^2: squared distance of each point to the nearest one that was seen from another place, or infinite.
 
-    Scans that were taken at the same place have the pattern of the sensor in common.
+    Args:
+        submap: has the nearest points.
+        other: has the points, its scouts.
+        poses: (K, 4, 4) `submap_T_other`.
+        points: (K * N, 3) m, the scouts at the poses.
     """
     places = at_poses(poses, other.lidars).reshape(len(poses), -1, 1, 3)
-    apart = np.linalg.norm(places - submap.lidars, axis=3) > const.MAX_BLUR_M
+    apart = np.linalg.norm(places - submap.lidars, axis=3) > const.SAME_PLACE_OF_SCANS_M
     index, squared = submap.tree.batch_knn_search(points, const.NEIGHBOURS, 1)
     theirs = submap.owner[np.asarray(index, np.intp)].reshape(len(poses), -1, const.NEIGHBOURS)
     ours = other.owner[other.picks[:: const.SCOUT_EVERY]]
@@ -182,7 +188,7 @@ class PassagePosition(NamedTuple):
 
 
 def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> PassagePosition | None:
-    """Return the pose along a passage at which the surfaces of two scans fit best; None where there is no passage.
+    """Return the pose along a passage at which the surfaces of two scans fit best; None elsewhere, and for submaps.
 
     Poses as far along as scans overlap are compared by some of the points, and the best are aligned. The best of these
     leads another when the misfit of the other is larger, and larger at enough places along the passage: at one place,
@@ -194,6 +200,8 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
         query: the query's scan.
         pose: (4, 4) `match_T_query`, a pose along the passage.
     """
+    if not patterned(match, query):
+        return None
     way, theirs = passage_direction(match), passage_direction(query)
     if way is None and theirs is not None:
         way = pose[:3, :3] @ theirs

@@ -26,7 +26,7 @@ from umf_ros.verification.pose_search import (
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans, inspect
-from umf_ros.verification.scan_consistency import ambiguity, locate_along, patterned
+from umf_ros.verification.scan_consistency import ambiguity, locate_along
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 
@@ -176,7 +176,7 @@ class Verifier:
         """Compare with other poses; of scans in a passage, move to the best position along it."""
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
-        found = locate_along(theirs, ours, hypothesis.pose) if patterned(theirs, ours) else None
+        found = locate_along(theirs, ours, hypothesis.pose)
         if found is None:
             hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
             return

@@ -272,20 +272,19 @@ def attenuate(values: Tensor, share: float) -> Tensor:
 
 def _encode_branch(network: UMF, batch: NetworkInput, branch: Branch) -> Features:
     """Run the encoder of one branch; the features of the other one are zero."""
-    tokens, fine = network.encode_image(batch) if branch == "image" else network.encode_cloud(batch)
-    scene = network.scene(batch.image) if branch == "image" and network.scene is not None else None
-    rows, width = len(batch.image), network.config.tokens
+    config, zeros = network.config, batch.image.new_zeros
     if branch == "image":
-        cloud = Tokens(batch.image.new_zeros(*batch.coarse_index.shape, width), batch.coarse_mask)
-        return Features(
-            tokens, cloud, fine, batch.image.new_zeros(*batch.fine_index.shape, network.config.local), scene
-        )
-    if network.scene is not None:
-        scene = batch.image.new_zeros(rows, network.config.scene)
-    cells = batch.image.new_zeros(rows, *network.cells.shape)
-    everywhere = torch.ones(cells.shape[:2], dtype=torch.bool, device=cells.device)
-    fine_image = batch.image.new_zeros(rows, network.config.local, *network.image_local.positions.shape[:2])
-    return Features(Tokens(cells, everywhere), tokens, fine_image, fine, scene)
+        tokens, fine = network.encode_image(batch)
+        scene = None if network.scene is None else network.scene(batch.image)
+        nothing = Tokens(zeros(*batch.coarse_index.shape, config.tokens), batch.coarse_mask)
+        return Features(tokens, nothing, fine, zeros(*batch.fine_index.shape, config.local), scene)
+    rows = len(batch.image)
+    cells = zeros(rows, *network.cells.shape)
+    nothing = Tokens(cells, torch.ones(cells.shape[:2], dtype=torch.bool, device=cells.device))
+    fine_image = zeros(rows, config.local, *network.image_local.positions.shape[:2])
+    scene = None if network.scene is None else zeros(rows, config.scene)
+    tokens, fine = network.encode_cloud(batch)
+    return Features(nothing, tokens, fine_image, fine, scene)
 
 
 class MetricLoss(nn.Module):
