@@ -352,6 +352,38 @@ def test_a_run_of_one_kind_does_not_resume_from_the_other(folder, tmp_path):
         umf("pretrain", "lidar", folder, "--out", tmp_path, "--preset", "tiny", "--steps", 1, "--batch", 2, "--resume")
 
 
+def test_a_recipe_trains_stage_by_stage_and_goes_on_where_it_was_interrupted(tmp_path):
+    out, recipe = tmp_path / "run", tmp_path / "recipe.yaml"
+    for part, seed in (("train", 1), ("validation", 10000)):  # there already: nothing is left to simulate
+        (out / "worlds" / part).mkdir(parents=True)
+        write_world(out / "worlds" / part / f"world_{seed:05d}.npz", seed, count=24)
+    settings = {"preset": "tiny", "batch": 4, "epoch_steps": 1, "validate_epochs": 1, "local_pairs": 0, "bank": 0}
+    stages = [{"steps": 2}, {"steps": 3, "freeze_encoders": True}]
+    content = {"training": "1:2", "validation": "10000:10001", "common": settings, "stages": stages}
+    recipe.write_text(yaml.safe_dump(content))
+    umf("train", "--recipe", recipe, "--out", out)
+    last = out / "stage_2" / "tiny.safetensors"
+    assert read_card(last)["earlier_runs"][0]["settings"]["steps"] == 2
+    assert Path(yaml.safe_load((out / "stage_2" / "training.yaml").read_text())["start"]).parent.name == "stage_1"
+    (out / "stage_2" / "checkpoint.pt").unlink()  # as if interrupted between the stages
+    before = (out / "stage_1" / "log.csv").read_bytes()
+    umf("train", "--recipe", recipe, "--out", out)
+    assert (out / "stage_1" / "log.csv").read_bytes() == before
+    assert read_card(last)["settings"]["steps"] == 3
+
+
+def test_a_run_keeps_no_weights_that_are_worse_than_those_at_its_start(folder, tmp_path):
+    torch.manual_seed(0)
+    save_weights(UMF(TINY), tmp_path / "start.safetensors", {})
+    chosen = {"start": str(tmp_path / "start.safetensors"), "validation": str(folder), "validate_epochs": 1}
+    settings = quick(folder, learning_rate=1e-12, fixed_statistics=True, **chosen)
+    objective = MetricObjective(make_network("tiny", settings.start), settings)
+    run, kept = Trainer(objective, WorldFolder(folder).refresh, settings, tmp_path, CPU), []
+    run.run(ignore, lambda: kept.append(run.progress.step))
+    assert run.progress.step == 2
+    assert kept == [0]
+
+
 def test_a_deeper_network_starts_as_the_one_it_grew_from(tmp_path, monkeypatch):
     torch.manual_seed(6)
     shallow = UMF(TINY).eval()

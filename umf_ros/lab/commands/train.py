@@ -7,13 +7,26 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from umf_ros.core.errors import ConfigError
+
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from umf_ros.lab.training.networks import RunSettings
     from umf_ros.lab.training.objective import Progress as RunProgress
 
 
 def command(
-    train: Annotated[str, typer.Argument(help="Folder of simulated worlds, or a YAML file that lists sequences.")],
+    train: Annotated[
+        str | None, typer.Argument(help="Folder of simulated worlds, or a YAML file that lists sequences.")
+    ] = None,
+    recipe: Annotated[
+        str | None,
+        typer.Option(
+            help="Instead of data and --config: umf_scene, or a YAML file. Simulates its worlds in --out, trains stage "
+            "by stage, and goes on where it was interrupted."
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the run: weights, card, log, checkpoint.")] = Path("runs/train"),
     validation: Annotated[str | None, typer.Option(help="Folder or YAML file for validation.")] = None,
     method: Annotated[
@@ -32,6 +45,12 @@ def command(
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")] = False,
 ) -> None:
     """Train a network; under torchrun, on several processes or GPUs."""
+    if (train is None) == (recipe is None):
+        raise ConfigError("name the training data, or a --recipe")
+    if recipe is not None:
+        _follow(recipe, out, workers, seed=seed, threads=threads, workers=workers, device=device)
+        return
+    assert train is not None
     if method == "dbow2":
         _grow_vocabulary(config, train, seed, out)
         return
@@ -49,6 +68,19 @@ def command(
     train_with_bar(load_run(config, **chosen), out, resume)
 
 
+def _follow(name: str, out: Path, processes: int | None, **overrides: object) -> None:
+    """Simulate the worlds of a recipe and train its stages, each from its checkpoint if there is one."""
+    from umf_ros.lab.training.recipe import read_recipe, simulate_worlds, stages
+
+    recipe = read_recipe(name)
+    following = stages(recipe, out, **overrides)
+    with _bars() as bars:
+        bar = bars.add_task("simulating worlds", total=None)
+        simulate_worlds(recipe, out / "worlds", processes, lambda done, of: bars.update(bar, completed=done, total=of))
+    for folder, settings in following:
+        train_with_bar(settings, folder, resume=(folder / "checkpoint.pt").exists())
+
+
 def _grow_vocabulary(config: Path | None, train: str, seed: int | None, out: Path) -> None:
     from rich.console import Console
 
@@ -61,14 +93,17 @@ def _grow_vocabulary(config: Path | None, train: str, seed: int | None, out: Pat
     typer.echo(f"weights: {weights}")
 
 
-def train_with_bar(settings: RunSettings, out: Path, resume: bool) -> None:
-    """Train with a progress bar, and print the path of the weights."""
+def _bars() -> Progress:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+
+
+def train_with_bar(settings: RunSettings, out: Path, resume: bool) -> None:
+    """Train with a progress bar, and print the path of the weights."""
     from umf_ros.lab.training.trainer import train
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns) as bars:
+    with _bars() as bars:
         bar = bars.add_task("training", total=settings.steps)
 
         def report(run: RunProgress) -> None:
@@ -115,7 +150,6 @@ def pretrain(
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")] = False,
 ) -> None:
     """Pretrain the encoder that the subcommand names."""
-    from umf_ros.core.errors import ConfigError
     from umf_ros.lab.training.trainer import load_run
 
     encoder = str(context.info_name)
@@ -157,7 +191,7 @@ def export(
     """
     from rich.console import Console
 
-    from umf_ros.core.errors import ConfigError, WeightsError
+    from umf_ros.core.errors import WeightsError
     from umf_ros.core.io import check_writable
     from umf_ros.embedding import FeatureRequest
     from umf_ros.embedding.runtimes import MODEL_SUFFIX, outputs_of

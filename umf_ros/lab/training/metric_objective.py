@@ -265,6 +265,8 @@ def _choose_parameters(network: UMF, settings: MetricSettings) -> None:
         network.requires_grad_(False)
         for layer in branch_layers(network, settings.branch):
             layer.requires_grad_(True)
+    if network.scene is not None:
+        network.scene.requires_grad_(False)  # fitted by `umf_ros.lab.fit.scene`: it must hold for photographs
     if settings.freeze_encoders:
         network.image_encoder.requires_grad_(False)
         network.voxel_encoder.requires_grad_(False)

@@ -200,8 +200,6 @@ def branch_layers(network: UMF, branch: Literal["image", "cloud"]) -> list[nn.Mo
     names = ["image_encoder" if branch == "image" else "voxel_encoder", f"{branch}_tokens"]
     names += [f"fusion.layers.{layer}.{branch}_self" for layer in range(network.config.layers)]
     names += [f"fusion.{branch}_{part}" for part in ("norm", "pool", "head")]
-    if branch == "image" and network.scene is not None:
-        names.append("scene.projection")
     return [network.get_submodule(name) for name in names]
 
 

@@ -51,6 +51,11 @@ class CameraLook:
         quality: of JPEG, 100 for none.
         zoom: share of the width and of the height that is seen.
         exposure: standard deviation of the logarithm of the exposure from picture to picture.
+        lamps: share of the light that comes from the rover's own lamps, 1 at night.
+        shadow: chance of a shadow that was not there before, for each picture.
+        glare: chance of the sun in or near the view, for each picture.
+        dust: number of specks on the lens, which stay where they are.
+        lens: seed of the specks.
     """
 
     gamma: float = 1.0
@@ -61,6 +66,11 @@ class CameraLook:
     quality: int = 100
     zoom: float = 1.0
     exposure: float = 0.0
+    lamps: float = 0.0
+    shadow: float = 0.0
+    glare: float = 0.0
+    dust: int = 0
+    lens: int = 0
 
     def take(self, image: Image, rng: np.random.Generator) -> Image:
         """The picture (h, w) as this camera takes it, at the same size."""
@@ -68,6 +78,7 @@ class CameraLook:
         light = self._crop(image).astype(np.float32) / 255
         light *= np.float32(np.exp(self.exposure * rng.standard_normal()))
         light *= _falloff(height, width, self.vignetting)
+        light = self._disturb(light, rng)
         if self.blur_px > 0:
             light = cv2.GaussianBlur(light, (0, 0), self.blur_px).astype(np.float32)
         values = np.clip(light, 0, 1) ** np.float32(self.gamma)
@@ -76,6 +87,28 @@ class CameraLook:
         values += (spread * rng.standard_normal(values.shape, dtype=np.float32)).astype(np.float32)
         taken = (np.clip(values, 0, 1) * 255).astype(np.uint8)
         return taken if self.quality >= 100 else _compress(taken, self.quality)
+
+    def _disturb(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """The light (h, w) under lamps, with a moved shadow, against the sun, through specks of dust."""
+        y, x = (
+            axis.astype(np.float32) for axis in np.ogrid[-1 : 1 : light.shape[0] * 1j, -1 : 1 : light.shape[1] * 1j]
+        )
+        if self.lamps > 0:
+            cone = 1.6 * np.exp(-(x**2) / 0.5 - (y - 0.4) ** 2 / 0.4)
+            light = light * (1 - self.lamps + self.lamps * cone)
+        if rng.random() < self.shadow:
+            angle, offset, edge = rng.uniform(0, 2 * np.pi), rng.uniform(-0.6, 0.6), rng.uniform(0.02, 0.2)
+            inside = 1 / (1 + np.exp((x * np.cos(angle) + y * np.sin(angle) - offset) / edge))
+            light = light * (1 - rng.uniform(0.3, 0.7) * inside)
+        if rng.random() < self.glare:
+            across, up = rng.uniform(-1.2, 1.2), rng.uniform(-1.2, -0.2)
+            light = light + rng.uniform(0.4, 1.5) * np.exp(-np.hypot(x - across, y - up) / rng.uniform(0.15, 0.8))
+        specks = np.random.default_rng(self.lens)
+        for _ in range(self.dust):
+            (across, down), size, cover = specks.uniform(-1, 1, 2), specks.uniform(0.03, 0.2), specks.uniform(0.3, 0.9)
+            speck = cover * np.exp(-((((x - across) ** 2 + (y - down) ** 2) / size**2) ** 2))
+            light = light * (1 - speck) + 0.5 * speck * light.mean()
+        return np.asarray(light, np.float32)
 
     def _crop(self, image: Image) -> Image:
         if self.zoom >= 1:
@@ -88,8 +121,8 @@ class CameraLook:
 
 
 def draw_look(rng: np.random.Generator) -> CameraLook:
-    """A camera at random, from a good one to a poor one."""
-    return CameraLook(
+    """A camera at random, from a good one to a poor one, sometimes dusty, by night, or against the sun."""
+    plain = CameraLook(
         gamma=float(np.exp(rng.normal(0, 0.3))),
         toe=float(rng.uniform(-0.3, 0.8)),
         vignetting=float(rng.choice([0.0, rng.uniform(0.1, 0.6)])),
@@ -99,6 +132,20 @@ def draw_look(rng: np.random.Generator) -> CameraLook:
         zoom=float(rng.choice([1.0, rng.uniform(0.6, 1.0)])),
         exposure=float(rng.uniform(0.05, 0.25)),
     )
+    night, hot, dusty = rng.random(3) < SELDOM
+    return replace(
+        plain,
+        noise=float(rng.uniform(0.05, 0.12)) if hot or night else plain.noise,
+        lamps=float(rng.uniform(0.5, 1.0)) if night else 0.0,
+        shadow=0.0 if night else float(rng.uniform(0, 0.5)),
+        glare=0.0 if night else float(rng.choice([0.0, rng.uniform(0.1, 0.5)])),
+        dust=int(rng.integers(1, 12)) if dusty else 0,
+        lens=int(rng.integers(2**31)),
+    )
+
+
+SELDOM = (0.12, 0.12, 0.3)
+"""Chances that a camera sees by night, is hot (thermal noise), or dusty."""
 
 
 def _falloff(height: int, width: int, lost: float) -> np.ndarray:

@@ -126,17 +126,22 @@ class Trainer:
             report: called after every step.
             keep: called by the leader when the network is the best so far.
         """
+        if self.progress.step == 0 and self._settings.start and getattr(self._settings, "validation", ""):
+            self._judge(keep)  # weights that are worse than those at the start are not kept
         while self.progress.step < self._settings.steps and not self.progress.stopped:
             self._epoch(report)
-            judgement = self._objective.judge(self.progress.step, self._folder) if self._team.leads else Judgement()
-            measured = {name: value for name, value in judgement.figures.items() if math.isfinite(value)}
-            self.progress.figures |= measured
-            if self._team.leads and judgement.keep:
-                keep()
-            self.progress.stopped = self._shared(judgement.stop)
-            if self._team.leads:
+            self._judge(keep)
+
+    def _judge(self, keep: Callable[[], None]) -> None:
+        judgement = self._objective.judge(self.progress.step, self._folder) if self._team.leads else Judgement()
+        self.progress.figures |= {name: value for name, value in judgement.figures.items() if math.isfinite(value)}
+        if self._team.leads and judgement.keep:
+            keep()
+        self.progress.stopped = self._shared(judgement.stop)
+        if self._team.leads:
+            if self.progress.step:
                 self._log(judgement.figures)
-                save_checkpoint(self._folder / "checkpoint.pt", self._state())
+            save_checkpoint(self._folder / "checkpoint.pt", self._state())
 
     def resume(self) -> None:
         """Go on from the checkpoint in the run's folder.
@@ -216,7 +221,15 @@ def load_run(path: Path | None, **overrides: object) -> Any:
         ConfigError: unreadable file, unknown method or name, or wrong value; names every one.
     """
     values = read_values(path) if path else {}
-    values |= {name: value for name, value in overrides.items() if value is not None}
+    return parse_run(values | {name: value for name, value in overrides.items() if value is not None})
+
+
+def parse_run(values: dict[str, Any]) -> Any:
+    """Settings of a run from their values, as `load_run`.
+
+    Raises:
+        ConfigError: unknown method or name, or wrong value; names every one.
+    """
     objective = find_objective(str(values.get("method", RunSettings.model_fields["method"].default)))
     try:
         return objective.settings_type.model_validate(values)
