@@ -289,7 +289,8 @@ def main() -> None:
         size = QUICK if given.quick else Size(ROVERS, None, 0)
         work = given.work / f"{'quick' if given.quick else 'full'}_{given.seed}"
         work.mkdir(parents=True, exist_ok=True)
-        folder, *_ = mapped(work, [simulated(work, given.seed, number, size) for number in range(1, ROVERS + 1)])
+        recordings = [simulated(work, given.seed, number, size) for number in range(1, ROVERS + 1)]
+        folder, *_ = mapped(work / "map", recordings)
     else:
         folder = MapFolder.open(given.map)
     figures = measure(folder, 10_000 if given.quick else 100_000, given.seed)

@@ -2,10 +2,13 @@
 
     python benchmarks/accuracy/sessions.py --json sessions.json               # five test worlds, some hours
     python benchmarks/accuracy/sessions.py --quick --seed 20001 --json F      # three short sessions, four cold starts
+    python benchmarks/accuracy/sessions.py --both-ways --seed 20001           # every second session the other way round
 
 Every session drives a part of one way of 100 m by a route, light and noise of its own; the world repeats itself
 (aliasing 1.0), and all clocks start at the same second. Recordings and maps stay in `--work` and are taken up again.
 A seed is a world; recordings are seeds + 1, + 2, and so on; the rover that wakes up drives the one after the last.
+With `--both-ways`, every second session and the rover that wakes up drive in the opposite direction, and it wakes up in
+the map of the other sessions, all driven against its direction. The LiDAR is 70 degrees wide.
 
 Prints and writes, over all worlds:
 - `wrong_between`: closures between sessions that the map believes and the truth refutes (0.5 m, 5 deg);
@@ -22,7 +25,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +43,9 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.families import FAMILIES
-from umf_ros.lab.simulation.presets import SESSION
+from umf_ros.lab.simulation.presets import SESSION, SESSION_LOOP_M, gentle_loop
+from umf_ros.lab.simulation.relief import Relief
+from umf_ros.lab.simulation.route import Walker
 from umf_ros.lab.simulation.simulator import Simulator, record
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.localizer import Localizer, read_poses
@@ -70,21 +75,30 @@ class Size:
 FULL, QUICK = Size(5, None, 10), Size(3, 40.0, 4)
 
 
-def simulated(work: Path, world: int, number: int, size: Size) -> Path:
+def drive_back(relief: Relief, rng: np.random.Generator) -> Walker:
+    """A part of the way of all sessions, in the opposite direction."""
+    loop = gentle_loop(relief, SESSION_LOOP_M, np.random.default_rng(0))[::-1]
+    return Walker(np.roll(loop, int(rng.integers(len(loop))), axis=0), rng).forward(75, lateral_m=0.7)
+
+
+BACK = replace(SESSION, plan=drive_back)
+
+
+def simulated(work: Path, world: int, number: int, size: Size, back: bool = False) -> Path:
     """The recording of a session, simulated unless it is there."""
-    path = work / f"s{number}.mcap"
+    path = work / f"s{number}{'_back' if back else ''}.mcap"
     if not path.exists():
-        family = FAMILIES[world % len(FAMILIES)]
-        simulator = Simulator(SESSION, world + number, size.duration_s, None, family, 1.0, world)
+        family, preset = FAMILIES[world % len(FAMILIES)], BACK if back else SESSION
+        simulator = Simulator(preset, world + number, size.duration_s, None, family, 1.0, world)
         with BagWriter(path) as bag:
             record(simulator, bag, workers=1)
     return path
 
 
-def mapped(work: Path, recordings: list[Path]) -> tuple[MapFolder, JointMap, dict[str, Any]]:
+def mapped(path: Path, recordings: list[Path]) -> tuple[MapFolder, JointMap, dict[str, Any]]:
     """The map of all recordings, of which those that are in it already are not replayed again."""
     opening = Opening()
-    folder = MapFolder.open_or_create(work / "map", opening.settings(open_bag(recordings[0])))
+    folder = MapFolder.open_or_create(path, opening.settings(open_bag(recordings[0])))
     known = {session.name for session in folder.sessions}
     for recording in recordings:
         if recording.stem not in known:
@@ -155,18 +169,21 @@ def shared_m(one: Trajectory, other: Trajectory) -> float:
     return float(steps[again[1:]].sum())
 
 
-def sees_again(poses: Array, known: Array) -> Any:
-    """(N,) which of N poses lie within a place of any known one, in about its direction."""
+def sees_again(poses: Array, known: Array, turn_rad: float = 0.0) -> Any:
+    """(N,) which of N poses lie within a place of any known one, in about its direction turned by an angle."""
     rows = known[:: max(1, len(known) // 500)]
     near = np.linalg.norm(poses[:, None, :3, 3] - rows[None, :, :3, 3], axis=-1) <= PLACE_RADIUS_M
-    turned = np.abs(wrap_angle(heading(poses)[:, None] - heading(rows)[None]))
+    turned = np.abs(wrap_angle(heading(poses)[:, None] - heading(rows)[None] - turn_rad))
     return (near & (turned <= np.radians(PLACE_ANGLE_DEG))).any(axis=1)
 
 
 def cold_starts(
-    folder: MapFolder, joint: JointMap, truths: dict[str, Trajectory], visitor: Path, count: int
+    folder: MapFolder, joint: JointMap, truths: dict[str, Trajectory], visitor: Path, count: int, turn_rad: float
 ) -> list[tuple[int | None, bool]]:
-    """Keyframes until each cold start knew its pose, None where it did not, and whether it was ever wrong."""
+    """Keyframes until each cold start knew its pose, None where it did not, and whether it was ever wrong.
+
+    All begin where a session of the map drove in the direction of the visitor, turned by an angle.
+    """
     bag, truth = open_bag(visitor), truth_of(visitor)
     settings = settings_for(bag, None, "auto", mode="localization", map=str(folder.path))
     stream = list(FrameReader(bag, settings).stream())
@@ -175,7 +192,7 @@ def cold_starts(
     map_T_world = align(true[:, :3, 3], placed[:, :3, 3])[0]
     frames = [row for row, item in enumerate(stream) if isinstance(item, Frame)]
     poses, known = truth.at(np.array([stream[row].stamp_ns for row in frames], np.int64))
-    usable = np.array(frames)[known & sees_again(poses, true)]
+    usable = np.array(frames)[known & sees_again(poses, true, turn_rad)]
     rows = usable[np.linspace(0, max(len(usable) - 60, 0), count).astype(int)]
     detector = LoopDetector(settings, make_detector_embedder(settings))
     return [wake(stream[row:], detector, settings, folder, map_T_world, truth) for row in rows]
@@ -207,14 +224,16 @@ def wake(
     return found, wrong
 
 
-def run_world(world: int, size: Size, work: Path) -> dict[str, Any]:
+def run_world(world: int, size: Size, work: Path, both_ways: bool) -> dict[str, Any]:
     """All figures of one world."""
     work.mkdir(parents=True, exist_ok=True)
-    recordings = [simulated(work, world, number, size) for number in range(1, size.sessions + 1)]
-    visitor = simulated(work, world, size.sessions + 1, size)
-    folder, joint, summary = mapped(work, recordings)
+    numbers = range(1, size.sessions + 1)
+    recordings = [simulated(work, world, number, size, both_ways and number % 2 == 0) for number in numbers]
+    visitor = simulated(work, world, size.sessions + 1, size, both_ways)
     truths = {recording.stem: truth_of(recording) for recording in recordings}
-    starts = cold_starts(folder, joint, truths, visitor, size.starts)
+    folder, joint, summary = mapped(work / "map", recordings)
+    known = mapped(work / "map_one_way", recordings[::2])[:2] if both_ways else (folder, joint)
+    starts = cold_starts(*known, truths, visitor, size.starts, np.pi * both_ways)
     found = [keyframes for keyframes, _ in starts if keyframes is not None]
     return {
         "world": world,
@@ -256,6 +275,7 @@ def seeds(first: int | None) -> Iterator[int]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="three sessions of 40 s, four cold starts")
+    parser.add_argument("--both-ways", action="store_true", help="sessions in both directions, cold starts against it")
     parser.add_argument("--seed", type=int, help="seed of a single world")
     parser.add_argument(
         "--work", type=Path, default=Path("results/sessions"), help="where recordings and maps are kept"
@@ -263,10 +283,10 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     arguments = parser.parse_args()
     size = QUICK if arguments.quick else FULL
-    kind = "quick" if arguments.quick else "full"
+    kind = ("quick" if arguments.quick else "full") + ("_both_ways" if arguments.both_ways else "")
     worlds = []
     for world in seeds(arguments.seed):
-        worlds.append(run_world(world, size, arguments.work / f"{kind}_{world}"))
+        worlds.append(run_world(world, size, arguments.work / f"{kind}_{world}", arguments.both_ways))
         print(json.dumps(worlds[-1]), flush=True)
     figures = summarise(worlds)
     print(json.dumps({name: value for name, value in figures.items() if name != "worlds"}, indent=2))
