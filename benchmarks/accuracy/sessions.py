@@ -8,7 +8,8 @@ Every session drives a part of one way of 100 m by a route, light and noise of i
 (aliasing 1.0), and all clocks start at the same second. Recordings and maps stay in `--work` and are taken up again.
 A seed is a world; recordings are seeds + 1, + 2, and so on; the rover that wakes up drives the one after the last.
 With `--both-ways`, every second session and the rover that wakes up drive in the opposite direction, and it wakes up in
-the map of the other sessions, all driven against its direction. The LiDAR is 70 degrees wide.
+the map of the other sessions, all driven against its direction. The LiDAR is 70 degrees wide. `--lidar-only` leaves out
+the images, which take most of the time.
 
 Prints and writes, over all worlds:
 - `wrong_between`: closures between sessions that the map believes and the truth refutes (0.5 m, 5 deg);
@@ -65,11 +66,12 @@ Stream = list[Frame | OdometrySample | AbsoluteMeasurement]
 
 @dataclass(frozen=True)
 class Size:
-    """How much is driven: sessions, seconds of each (None: the whole route), cold starts."""
+    """How much is driven: sessions, seconds of each (None: the whole route), cold starts, and whether with images."""
 
     sessions: int
     duration_s: float | None
     starts: int
+    images: bool = True
 
 
 FULL, QUICK = Size(5, None, 10), Size(3, 40.0, 4)
@@ -90,6 +92,8 @@ def simulated(work: Path, world: int, number: int, size: Size, back: bool = Fals
     if not path.exists():
         family, preset = FAMILIES[world % len(FAMILIES)], BACK if back else SESSION
         simulator = Simulator(preset, world + number, size.duration_s, None, family, 1.0, world)
+        if not size.images:
+            simulator.exposures = []
         with BagWriter(path) as bag:
             record(simulator, bag, workers=1)
     return path
@@ -276,14 +280,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="three sessions of 40 s, four cold starts")
     parser.add_argument("--both-ways", action="store_true", help="sessions in both directions, cold starts against it")
+    parser.add_argument("--lidar-only", action="store_true", help="without images")
     parser.add_argument("--seed", type=int, help="seed of a single world")
     parser.add_argument(
         "--work", type=Path, default=Path("results/sessions"), help="where recordings and maps are kept"
     )
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     arguments = parser.parse_args()
-    size = QUICK if arguments.quick else FULL
+    size = replace(QUICK if arguments.quick else FULL, images=not arguments.lidar_only)
     kind = ("quick" if arguments.quick else "full") + ("_both_ways" if arguments.both_ways else "")
+    kind += "_lidar" if arguments.lidar_only else ""
     worlds = []
     for world in seeds(arguments.seed):
         worlds.append(run_world(world, size, arguments.work / f"{kind}_{world}", arguments.both_ways))
