@@ -310,8 +310,9 @@ class LoopDetector:
         return self.inter_robot.next() if self.inter_robot is not None else None
 
     def close(self) -> None:
-        """Disconnect from the fleet's server, and release the database and the scans."""
+        """Disconnect from the fleet's server, and release the database, the network and the scans."""
         self._network.shutdown(cancel_futures=True)
+        del self._embedder
         self._verifier.reset()
         if self.inter_robot is not None:
             self.inter_robot.link.close()

@@ -98,6 +98,7 @@ def command(
     unfinished = unfinished_folder(out, bag, settings) if resume and not settings.localizing else None
     folder = unfinished or create_folder(out, bag)
     detector = detector or LoopDetector(with_places(settings, folder), network)
+    del network, starting  # only the detector keeps the network, until it is closed: the report needs the memory
     absent = [one.line for one in absent_inputs(recording, settings, odometry is not None)]
     for line in absent:
         console.print(line, **WARNING)
