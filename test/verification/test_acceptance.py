@@ -20,15 +20,13 @@ from umf_ros.verification.acceptance import (
     refuted,
     scores,
 )
-from umf_ros.verification.constants import MAX_MISFIT, MIN_LEAD, MIN_TERRAIN, SUBMAP_UNEXPLAINED
-from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, kind_of
+from umf_ros.verification.constants import MAX_MISFIT, MIN_LEAD, SUBMAP_UNEXPLAINED
+from umf_ros.verification.hypothesis import IMAGE, SCAN, kind_of
 from umf_ros.verification.measurement import MEASUREMENTS
 
 RIVALS, STANDING = ("rival_near", "rival_far"), ("upright_counterparts", "unexplained")
-NARROW = {"terrain_rival": 0.2, "relief_m": 0.1, "prior_sigmas": 0.8, "support": 2.0}
 PAIRS = {
     SCAN: (GOOD, BAD),
-    SUBMAP: (GOOD | NARROW, BAD | NARROW | {"terrain_rival": 0.5, "support": 0.0}),
     IMAGE: (GOOD_VIEWS, BAD_VIEWS),
 }
 NAN = math.nan
@@ -82,8 +80,7 @@ def test_every_criterion_reads_what_is_measured_and_no_more(kind: str) -> None:
     """A good fit has all that the criteria need, and no other measurement changes a score."""
     good, _ = PAIRS[kind]
     others = {name: 0.123 for name in MEASUREMENTS if name not in good}
-    for name in ("noise_m", "terrain_rival"):  # they would make another kind of it
-        others.pop(name, None)
+    others.pop("noise_m", None)  # it would make another kind of it
     assert scores(good | others) == scores(good)
     assert set(scores(good)) == set(CRITERIA[kind])
 
@@ -114,8 +111,7 @@ def test_contributions_add_up_to_the_log_odds(shipped: AcceptanceModel, kind: st
     for measurements in PAIRS[kind]:
         odds = sum(shipped.contributions(measurements).values())
         assert shipped.probability(measurements) == pytest.approx(1 / (1 + math.exp(-odds)))
-        decisive = (SUBMAP, SCAN) if kind == SUBMAP else (kind,)
-        assert shipped.contributions(measurements)["bias"] in [shipped.models[one].bias for one in decisive]
+        assert shipped.contributions(measurements)["bias"] == shipped.models[kind].bias
 
 
 def test_saved_model_reads_back(shipped: AcceptanceModel, tmp_path: Path) -> None:
@@ -215,8 +211,7 @@ def test_what_was_never_measured_is_not_what_a_closure_was_lost_by(shipped: Acce
         (GOOD | {"merged": 12.0, "unexplained": 0.99 * SUBMAP_UNEXPLAINED}, None),
         (GOOD | {"merged": 12.0, "unexplained": 1.01 * SUBMAP_UNEXPLAINED}, RejectReason.UNEXPLAINED),
         (GOOD | {"merged": 1.0, "unexplained": 1.01 * SUBMAP_UNEXPLAINED}, None),
-        (GOOD | NARROW | {"terrain_correlation": 0.99 * MIN_TERRAIN}, RejectReason.TERRAIN),
-        (GOOD | {"terrain_correlation": 0.99 * MIN_TERRAIN}, None),
+        (GOOD | {"merged": 12.0, "narrow": 1.0, "unexplained": 1.01 * SUBMAP_UNEXPLAINED}, None),
         (without(GOOD, *RIVALS), None),
         (GOOD | {"residual_m": 0.99 * MAX_MISFIT * GOOD["noise_m"]}, None),
         (GOOD | {"residual_m": 1.01 * MAX_MISFIT * GOOD["noise_m"]}, RejectReason.MISFIT),
@@ -229,10 +224,3 @@ def test_a_rival_and_surfaces_apart_refute_scans_however_probable(
 ) -> None:
     objection = refuted(measurements)
     assert (objection and objection[0]) == reason
-
-
-def test_a_submap_is_decided_by_its_terrain_or_its_scan_whichever_is_more_probable(shipped: AcceptanceModel) -> None:
-    bare = {"terrain_correlation": 0.1, "terrain_rival": 0.1, "overlap": 0.3, "support": 0.0, "prior_sigmas": 9.0}
-    by_scan, by_terrain = GOOD | NARROW | bare, GOOD | NARROW | dict.fromkeys(RIVALS, -1.0) | {"contradiction": 0.4}
-    assert shipped.probability(by_scan) == shipped.probability(without(by_scan, "terrain_rival")) > 0.9
-    assert shipped.probability(by_terrain) > 0.9 > shipped.probability(without(by_terrain, "terrain_rival"))

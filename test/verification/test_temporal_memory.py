@@ -1,16 +1,15 @@
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from umf_ros.core.frames import Candidate, Embedding, Keyframe
-from umf_ros.core.geometry import invert, make_pose, relative
+from umf_ros.core.geometry import make_pose, relative
 from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA, landscape, pose_at
 from umf_ros.verification.constants import MEMORY_KEYFRAMES
-from umf_ros.verification.pose_search import TemporalMemory, prior_sigmas
+from umf_ros.verification.pose_search import TemporalMemory
 
 GROUND = landscape(0, bumps=1)
 
@@ -102,19 +101,3 @@ def test_of_the_expected_places_the_nearest_is_taken_and_none_that_is_far() -> N
     assert memory.expected(query, candidates) == [candidates[2]]
     assert memory.expected(query, candidates[3:]) == []  # five metres off
     assert memory.expected(query, []) == []
-
-
-def test_distance_from_odometry_is_measured_in_standard_deviations_of_its_drift() -> None:
-    query, match, _ = pair(0.0)
-    predicted = relative(match.odom_T_body, query.odom_T_body)
-    aside = predicted @ make_pose(np.eye(3), [0, 2.8, 0])
-    driven_m = query.path_length_m - match.path_length_m
-    assert prior_sigmas(query, match, predicted, 0.02) == 0
-    assert prior_sigmas(query, match, aside, 0.02) == pytest.approx(2.8 / (1 + 0.02 * driven_m))
-    assert prior_sigmas(match, query, invert(aside), 0.02) == pytest.approx(2.8 / (1 + 0.02 * driven_m))
-
-
-@pytest.mark.parametrize("change", [{"odom_T_body": None}, {"session": 7}])
-def test_without_odometry_or_across_sessions_nothing_is_predicted(change: dict[str, object]) -> None:
-    query, match, pose = pair(0.0)
-    assert math.isnan(prior_sigmas(replace(query, **change), match, pose, 0.02))

@@ -51,7 +51,11 @@ ALSO = (
     "umf map edit decides about closures of a map by hand, umf map grow adds a drive that localised in it, "
     "umf map export writes the map of the ground for other limits of a rover."
 )
-app = typer.Typer(cls=_MakeOrChange, rich_markup_mode="rich")
+app = typer.Typer(
+    cls=_MakeOrChange,
+    rich_markup_mode="rich",
+    help="Make one map of many recordings, add recordings to one, edit and export it.",
+)
 
 
 @app.command("make", epilog=ALSO)

@@ -145,7 +145,7 @@ class Verification(Group):
     max_turn_deg: float = Field(0.0, ge=0, le=180, description="largest rotation of a closure, deg; 0: no limit")
     max_shift_m: float = Field(11.5, ge=0, description="largest translation of a closure, m; 0: no limit")
     odometry_drift: float = Field(
-        0.05, gt=0, le=1, description="odometry error per distance driven, for the soft prior"
+        0.05, gt=0, le=1, description="odometry error per distance driven, for the agreement of a fleet's closures"
     )
     calibration: str = Field("", description="fitted acceptance model (JSON); empty: the shipped one")
 

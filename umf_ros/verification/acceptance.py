@@ -17,7 +17,7 @@ from typing import Any
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.resources import find
 from umf_ros.verification import constants as const
-from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, RejectReason, kind_of
+from umf_ros.verification.hypothesis import IMAGE, SCAN, RejectReason, kind_of
 from umf_ros.verification.scan_alignment import CovarianceModel
 
 SHIPPED = "config/verification/calibration.json"
@@ -79,16 +79,6 @@ CRITERIA: dict[str, dict[str, Criterion]] = {
         "position_known": _log_of("position_std_m", 1.0, 0.05),
         "heading_known": _log_of("heading_std_deg", 5.0, 0.2),
     },
-    SUBMAP: {
-        "submap_correlation": _of("terrain_correlation", 0.2, 0.8),
-        "submap_terrain": _of("terrain_score", 5.0, 30.0),
-        "submap_unique": Criterion(lambda known: known["terrain_correlation"] - known["terrain_rival"], 0.0, 0.6),
-        "submap_overlap": _of("overlap", 0.6, 0.95),
-        "submap_position_known": _log_of("position_std_m", 1.0, 0.1),
-        "submap_relief": _log_ratio("relief_m", "residual_m", 1.5, 6.0),
-        "submap_odometry": _of("prior_sigmas", 4.0, 1.0, missing=0.7),
-        "submap_support": _of("support", 0.0, 2.0),
-    },
     IMAGE: {
         "inliers": Criterion(
             lambda known: math.log1p(known.get("inliers_image", 0.0) + known.get("inliers_cloud", 0.0)),
@@ -107,14 +97,13 @@ CRITERIA: dict[str, dict[str, Criterion]] = {
 }
 
 
-def scores(measurements: Measurements, kind: str = "") -> dict[str, float]:
-    """How far the measurements meet every criterion of their kind, or of another, 0 to 1, by name.
+def scores(measurements: Measurements) -> dict[str, float]:
+    """How far the measurements meet every criterion of their kind, 0 to 1, by name.
 
     In a passage its positions were compared by surfaces, and no rival by points counts.
     """
     measurements = measurements | (WITHOUT_RIVALS if _in_passage(measurements) else {})
-    criteria = CRITERIA[kind or kind_of(measurements)]
-    return {name: criterion(measurements) for name, criterion in criteria.items()}
+    return {name: criterion(measurements) for name, criterion in CRITERIA[kind_of(measurements)].items()}
 
 
 def _in_passage(measurements: Measurements) -> bool:
@@ -124,8 +113,7 @@ def _in_passage(measurements: Measurements) -> bool:
 
 def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
     """Why a hypothesis is no closure however probable, with figures; None when nothing refutes it."""
-    kind = kind_of(measurements)
-    if kind == IMAGE:
+    if kind_of(measurements) == IMAGE:
         return None
     misfit = measurements["residual_m"] / measurements["noise_m"]
     if misfit > const.MAX_MISFIT:
@@ -133,11 +121,8 @@ def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
     if measurements.get("lead", math.nan) < 1.0:
         return RejectReason.PASSAGE if _in_passage(measurements) else RejectReason.AMBIGUOUS, ""
     unexplained = measurements.get("unexplained", math.nan)
-    if kind == SCAN and measurements.get("merged", 1.0) > 1 and unexplained > const.SUBMAP_UNEXPLAINED:
+    if measurements.get("merged", 1.0) > 1 and "narrow" not in measurements and unexplained > const.SUBMAP_UNEXPLAINED:
         return RejectReason.UNEXPLAINED, f"{unexplained:.0%}"
-    correlation = measurements["terrain_correlation"]
-    if kind == SUBMAP and not correlation >= const.MIN_TERRAIN:
-        return RejectReason.TERRAIN, f"correlation {correlation:.2f}"
     return (RejectReason.AMBIGUOUS, "") if measurements.get("runner_up", math.nan) < const.MIN_LEAD else None
 
 
@@ -158,7 +143,7 @@ class AcceptanceModel:
     """Everything that was fitted.
 
     Attributes:
-        models: one logistic model per kind of hypothesis: `SCAN`, `SUBMAP` and `IMAGE`.
+        models: one logistic model per kind of hypothesis: `SCAN` and `IMAGE`.
         covariances: likewise, what turns residuals into a covariance.
         bounds: likewise, least and greatest of what right poses measured, by the name of the number.
     """
@@ -169,14 +154,8 @@ class AcceptanceModel:
 
     def probability(self, measurements: Measurements) -> float:
         """Probability that the closure with these measurements is right."""
-        kind = self._decisive(measurements)
-        odds = self.models[kind].odds(scores(measurements, kind))
+        odds = self.models[kind_of(measurements)].odds(scores(measurements))
         return 1.0 / (1.0 + math.exp(-min(max(odds, -60.0), 60.0)))
-
-    def _decisive(self, measurements: Measurements) -> str:
-        """The kind that decides: of a submap its terrain or its scan, whichever is more probable."""
-        kinds = (SUBMAP, SCAN) if kind_of(measurements) == SUBMAP else (kind_of(measurements),)
-        return max(kinds, key=lambda kind: self.models[kind].odds(scores(measurements, kind)))
 
     def at_best(self, measurements: Measurements) -> float:
         """The same if no other pose fitted the scans: what it cannot exceed before the ambiguity is known."""
@@ -184,8 +163,7 @@ class AcceptanceModel:
 
     def out_of_range(self, measurements: Measurements) -> str:
         """Name and value of a number that no right example of the fit had; empty without one."""
-        kind = SCAN if kind_of(measurements) == SUBMAP else kind_of(measurements)
-        for name, (least, greatest) in self.bounds.get(kind, {}).items():
+        for name, (least, greatest) in self.bounds.get(kind_of(measurements), {}).items():
             value = measurements.get(name, math.nan)
             if value < least or value > greatest:  # an unknown value is neither
                 return f"{name} {value:.3g}"
@@ -193,14 +171,12 @@ class AcceptanceModel:
 
     def contributions(self, measurements: Measurements) -> dict[str, float]:
         """Log-odds of each criterion by name; "bias" is what has to be overcome."""
-        kind = self._decisive(measurements)
-        model, scored = self.models[kind], scores(measurements, kind)
+        model, scored = self.models[kind_of(measurements)], scores(measurements)
         return {name: weight * scored[name] for name, weight in model.weights.items()} | {"bias": model.bias}
 
     def lost(self, measurements: Measurements) -> dict[str, float]:
         """Log-odds that each criterion could have added and did not; without those whose value is unknown."""
-        kind = self._decisive(measurements)
-        scored = scores(measurements, kind)
+        kind, scored = kind_of(measurements), scores(measurements)
         known = [name for name, one in CRITERIA[kind].items() if math.isfinite(one.read(measurements))]
         weights = self.models[kind].weights
         lost = {name: weights[name] * (1.0 - scored[name]) for name in known}
@@ -218,7 +194,6 @@ def load_acceptance(path: str = "") -> AcceptanceModel:
         content = json.loads(file.read_text(encoding="utf-8"))
         models = {kind: _logistic(content["models"][kind], kind) for kind in CRITERIA}
         covariances = {kind: CovarianceModel(**content["covariance"][kind]) for kind in (SCAN, IMAGE)}
-        covariances[SUBMAP] = covariances[SCAN]
         bounds = {
             kind: {name: (float(least), float(greatest)) for name, (least, greatest) in numbers.items()}
             for kind, numbers in content.get("bounds", {}).items()

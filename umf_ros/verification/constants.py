@@ -117,18 +117,12 @@ PASSAGE_LEAD, PASSAGE_SIGMAS, PATTERN_SIGMAS = 0.12, 1.6, 2.4
 # temporal memory
 MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of keyframes
 ODOMETRY_REACH_M = 20.0  # measured: path over which odometry is trusted, and scans are merged; 10 finds less
-PRIOR_M = 1.0  # by hand: standard deviation of what odometry predicts before any way is driven
 
-# submaps of narrow sensors, judged by their terrain
-RIVAL_TERRAIN_M = (1.5, 3.0)  # geometry: beyond the error of a right pose, within a wrong one's
-MIN_TERRAIN = 0.3  # by hand: correlation of the terrain without which submaps of a corridor fit at many places
-NARROW_DEG = 270.0  # geometry: a sensor that sees more recognises a place from any side by its scans
-
+# submaps: what is seen on the metres around a keyframe
+NARROW_DEG = 270.0  # geometry: a sensor that sees more shows all sides of a place in one scan
 # measured on validation domains: share of what stands that the other submap lacks; more at 1 of 92 right poses, and at
 # all 16 that were accepted between two warehouses with the same racks
 SUBMAP_UNEXPLAINED = 0.1
-
-# submaps: what is seen on the metres around a keyframe
 MERGE_STEP_M = 1.5  # measured: between the scans that are merged; 1 and 2 m are as good
 ENOUGH_SEEN, MOST_SEEN = 0.6, 0.85  # of what all these scans show nearby: one scan is enough, and where merging stops
 MERGED_POINTS = 12_000  # measured: 8,000 find less, 16,000 hardly more

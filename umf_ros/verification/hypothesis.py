@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from umf_ros.verification.view_alignment import PairedViews, ViewAlignment
 
 ACCEPTED = "accepted"
-SCAN, SUBMAP, IMAGE = "scan", "submap", "image"
+SCAN, IMAGE = "scan", "image"
 
 
 class RejectReason(Enum):
@@ -34,7 +34,6 @@ class RejectReason(Enum):
     PASSAGE = "surfaces fit as well elsewhere along the passage"
     AMBIGUOUS = "another pose fits as well"
     UNEXPLAINED = "too much of what stands in one submap is missing in the other"
-    TERRAIN = "the terrain of the submaps does not fit"
     OUT_OF_RANGE = "a measurement outside the range of the fitted examples"
     TURNED = "turned by more than verification.max_turn_deg"
     TOO_FAR = "farther apart than verification.max_shift_m"
@@ -89,7 +88,7 @@ class Hypothesis:
 
     @property
     def kind(self) -> str:
-        """How the pose was measured: `SCAN`, `SUBMAP`, `IMAGE`, or empty without a pose."""
+        """How the pose was measured: `SCAN`, `IMAGE`, or empty without a pose."""
         return kind_of(self.measurements)
 
     @property
@@ -141,10 +140,7 @@ def known_only(measurements: dict[str, float]) -> dict[str, float]:
 
 
 def kind_of(measurements: dict[str, float]) -> str:
-    """Return `SCAN` where two scans were aligned and `IMAGE` where only views were; empty without a pose.
-
-    `SUBMAP` where one of the scans was merged from those of a narrow sensor.
-    """
+    """Return `SCAN` where two scans were aligned and `IMAGE` where only views were; empty without a pose."""
     if "noise_m" in measurements:
-        return SUBMAP if "terrain_rival" in measurements else SCAN
+        return SCAN
     return IMAGE if "pose_inliers" in measurements else ""

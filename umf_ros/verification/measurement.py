@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from umf_ros.core.geometry import Array, make_pose
+from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import terrain_fit
 from umf_ros.verification.hypothesis import IMAGE, Hypothesis, known_only, same_pose
@@ -37,9 +37,9 @@ MEASUREMENTS = {
     "overlap": "share of the points seen by both that have a counterpart; of views, share of the pairs that agree",
     "points": "points that have a counterpart",
     "merged": "scans behind the larger of two submaps; 1 where two single scans were aligned",
+    "narrow": "1 where a submap is of a sensor that sees little around it; submaps then show different sides",
     "terrain_correlation": "correlation of the relief of both scans, -1 to 1",
     "terrain_score": "the same in standard deviations of chance",
-    "terrain_rival": "the correlation at the best of some poses beside this one, of submaps of narrow sensors",
     "relief_m": "standard deviation of the relief on the ground that both scans saw",
     "common": "share of a scan's points that the other should see, the smaller of both ways, as all that follow",
     "contradiction": "share of these that the other's rays passed by, the larger of both",
@@ -58,7 +58,6 @@ MEASUREMENTS = {
     "two_way_m": "distance of the poses that the query's depths and the match's give by themselves",
     "position_std_m": "standard deviation of the position along its least known direction, from the residuals",
     "heading_std_deg": "of the heading",
-    "prior_sigmas": "distance from what odometry predicts, in standard deviations of its drift",
     "support": "earlier keyframes, of the last few, that found a pose which odometry carries over to this one",
 }
 """Name and meaning of every measurement, as in `candidates.csv` and on `~/candidates`."""
@@ -108,10 +107,6 @@ def closure_covariance(hypothesis: Hypothesis, model: CovarianceModel) -> Array:
 def _measure_scans(alignment: Alignment, match: PreparedScan, query: PreparedScan) -> dict[str, float]:
     level = levelled(match, query, alignment.pose)
     correlation, score, relief_m = terrain_fit(match.terrain, query.terrain, level)
-    rival = {}
-    if match.narrow or query.narrow:
-        beside = [terrain_fit(match.terrain, query.terrain, move @ level)[0] for move in _BESIDE]
-        rival = {"terrain_rival": max(beside)}
     size = np.abs(alignment.residuals) if len(alignment.residuals) else np.full(1, const.FINE_REACH_M)
     return {
         "residual_m": float(np.median(size)),
@@ -123,16 +118,9 @@ def _measure_scans(alignment: Alignment, match: PreparedScan, query: PreparedSca
         "terrain_correlation": correlation,
         "terrain_score": score,
         "relief_m": relief_m,
-        **rival,
+        **({"narrow": 1.0} if match.narrow or query.narrow else {}),
         **compare_scans(match, query, alignment.pose),
     }
-
-
-_BESIDE = [
-    make_pose(np.eye(3), [metres * math.cos(angle), metres * math.sin(angle), 0])
-    for metres in const.RIVAL_TERRAIN_M
-    for angle in np.arange(0, 2 * np.pi, np.pi / 4)
-]
 
 
 def _measure_views(alignment: ViewAlignment) -> dict[str, float]:

@@ -260,18 +260,6 @@ class TemporalMemory:
         )
 
 
-def prior_sigmas(query: Keyframe, match: Keyframe, match_T_query: Array, drift: float) -> float:
-    """Distance from what odometry alone predicts, in standard deviations of its drift; NaN without odometry.
-
-    The test is soft by construction: after a long path, odometry predicts next to nothing.
-    """
-    if query.odom_T_body is None or match.odom_T_body is None or query.session != match.session:
-        return float("nan")
-    predicted = relative(match.odom_T_body, query.odom_T_body)
-    driven = abs(query.path_length_m - match.path_length_m)
-    return float(np.linalg.norm(predicted[:3, 3] - match_T_query[:3, 3]) / (const.PRIOR_M + drift * driven))
-
-
 def _carried(found: _Finding, query: Keyframe, match: Keyframe) -> Array | None:
     """`match_T_query` as odometry carries it over from an earlier finding; None where that is far or unknown."""
     steps = []

@@ -14,14 +14,13 @@ from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
-from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
+from umf_ros.verification.hypothesis import Hypothesis, RejectReason, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
 from umf_ros.verification.pose_search import (
     RotatedMaps,
     TemporalMemory,
     consistent_pixels,
     find_hypotheses,
-    prior_sigmas,
 )
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
@@ -167,9 +166,7 @@ class Verifier:
     def _measure(self, hypothesis: Hypothesis) -> None:
         """Measure the pose; nothing stays of a pose that was measured before."""
         query, match = hypothesis.keyframes
-        prior = prior_sigmas(query, match, hypothesis.pose, self._settings.odometry_drift)
-        support = self._memory.support(query, match, hypothesis.pose)
-        of_pose = measure(hypothesis) | known_only({"prior_sigmas": prior, "support": support})
+        of_pose = measure(hypothesis) | {"support": self._memory.support(query, match, hypothesis.pose)}
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
     def _look_elsewhere(self, hypothesis: Hypothesis) -> None:
