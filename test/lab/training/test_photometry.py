@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
 
-from umf_ros.lab.training.prepared_views import CameraLook, draw_look
+import numpy as np
+from tiny_worlds import TINY, world_arrays
+
+from umf_ros.lab.datasets.simulated import SimulatedWorld
+from umf_ros.lab.datasets.views import Augmentation, CameraLook, ViewMaker, draw_look
 
 RAMP = np.tile(np.linspace(20, 200, 96).astype(np.uint8), (64, 1))
 
@@ -49,3 +53,29 @@ def test_drawn_cameras_differ_and_keep_the_picture_recognisable() -> None:
     scene = np.kron(rng.integers(40, 200, (8, 12)), np.ones((8, 8))).astype(np.uint8)
     alike = [np.corrcoef(take(look, 3, scene).ravel(), scene.ravel())[0, 1] for look in looks if look.zoom == 1]
     assert min(alike) > 0.6
+
+
+def test_night_sun_shadows_and_dust_change_what_they_should() -> None:
+    flat = np.full((64, 96), 120, np.uint8)
+    night = take(CameraLook(lamps=1.0), image=flat)
+    assert night[45, 48] > 120 and night[0, 0] < 40
+    shaded = take(CameraLook(shadow=1.0), image=flat)
+    assert shaded.min() < 90 and shaded.max() >= 119
+    against_the_sun = take(CameraLook(glare=1.0), image=flat)
+    assert against_the_sun.max() > 200 and against_the_sun[:20].mean() > against_the_sun[-20:].mean()
+    dusty = CameraLook(dust=6, lens=1, noise=0.01)
+    specks = [take(dusty, seed, RAMP).astype(float) - RAMP for seed in (1, 2)]
+    assert np.abs(specks[0]).max() > 20 and np.corrcoef(specks[0].ravel(), specks[1].ravel())[0, 1] > 0.9
+
+
+def test_training_views_are_taken_by_other_cameras_on_request(tmp_path: Path) -> None:
+    np.savez(tmp_path / "world_00001.npz", **world_arrays())
+    sample = SimulatedWorld(tmp_path / "world_00001.npz").sample(0)
+    plain, other = (
+        [
+            ViewMaker(TINY, Augmentation(look=look)).varied(sample, np.random.default_rng(seed)).image
+            for seed in range(8)
+        ]
+        for look in (0.0, 1.0)
+    )
+    assert np.std(plain, axis=0).mean() < np.std(other, axis=0).mean()

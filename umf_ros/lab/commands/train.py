@@ -70,7 +70,7 @@ def command(
 
 def _follow(name: str, out: Path, processes: int | None, **overrides: object) -> None:
     """Simulate the worlds of a recipe and train its stages, each from its checkpoint if there is one."""
-    from umf_ros.lab.training.recipe import read_recipe, simulate_worlds, stages
+    from umf_ros.lab.training.trainer import read_recipe, simulate_worlds, stages
 
     recipe = read_recipe(name)
     following = stages(recipe, out, **overrides)

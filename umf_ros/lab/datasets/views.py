@@ -1,8 +1,8 @@
-"""Views of a place for the network, and their correspondences."""
+"""Views of a place for the network, as different cameras take them, and their correspondences."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -35,8 +35,132 @@ def read_frame(frame: Frame, config: NetworkConfig) -> NetworkInput:
 
 
 @dataclass(frozen=True, slots=True)
+class CameraLook:
+    """Response of one camera to the light.
+
+    Attributes:
+        gamma: exponent of the response; 1 leaves the picture as it is.
+        toe: strength of the S-curve around middle grey, 0 for none.
+        vignetting: share of the light that is lost in the corners.
+        blur_px: standard deviation of the point spread, pixels.
+        noise: standard deviation at middle grey, of full scale.
+        quality: of JPEG, 100 for none.
+        zoom: share of the width and of the height that is seen.
+        exposure: standard deviation of the logarithm of the exposure from picture to picture.
+        lamps: share of the light that comes from the rover's own lamps, 1 at night.
+        shadow: chance of a shadow that was not there before, for each picture.
+        glare: chance of the sun in or near the view, for each picture.
+        dust: number of specks on the lens, which stay where they are.
+        lens: seed of the specks.
+    """
+
+    gamma: float = 1.0
+    toe: float = 0.0
+    vignetting: float = 0.0
+    blur_px: float = 0.0
+    noise: float = 0.0
+    quality: int = 100
+    zoom: float = 1.0
+    exposure: float = 0.0
+    lamps: float = 0.0
+    shadow: float = 0.0
+    glare: float = 0.0
+    dust: int = 0
+    lens: int = 0
+
+    def take(self, image: Image, rng: np.random.Generator) -> Image:
+        """The picture (h, w) as this camera takes it, at the same size."""
+        height, width = image.shape
+        light = self._crop(image).astype(np.float32) / 255
+        light *= np.float32(np.exp(self.exposure * rng.standard_normal()))
+        light *= _falloff(height, width, self.vignetting)
+        light = self._disturb(light, rng)
+        if self.blur_px > 0:
+            light = cv2.GaussianBlur(light, (0, 0), self.blur_px).astype(np.float32)
+        values = np.clip(light, 0, 1) ** np.float32(self.gamma)
+        values += np.float32(self.toe) * (values * values * (3 - 2 * values) - values)
+        spread = self.noise * np.sqrt(0.25 + 1.5 * values)  # shot noise grows with the light
+        values += (spread * rng.standard_normal(values.shape, dtype=np.float32)).astype(np.float32)
+        taken = (np.clip(values, 0, 1) * 255).astype(np.uint8)
+        return taken if self.quality >= 100 else _compress(taken, self.quality)
+
+    def _disturb(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """The light (h, w) under lamps, with a moved shadow, against the sun, through specks of dust."""
+        y, x = (
+            axis.astype(np.float32) for axis in np.ogrid[-1 : 1 : light.shape[0] * 1j, -1 : 1 : light.shape[1] * 1j]
+        )
+        if self.lamps > 0:
+            cone = 1.6 * np.exp(-(x**2) / 0.5 - (y - 0.4) ** 2 / 0.4)
+            light = light * (1 - self.lamps + self.lamps * cone)
+        if rng.random() < self.shadow:
+            angle, offset, edge = rng.uniform(0, 2 * np.pi), rng.uniform(-0.6, 0.6), rng.uniform(0.02, 0.2)
+            inside = 1 / (1 + np.exp((x * np.cos(angle) + y * np.sin(angle) - offset) / edge))
+            light = light * (1 - rng.uniform(0.3, 0.7) * inside)
+        if rng.random() < self.glare:
+            across, up = rng.uniform(-1.2, 1.2), rng.uniform(-1.2, -0.2)
+            light = light + rng.uniform(0.4, 1.5) * np.exp(-np.hypot(x - across, y - up) / rng.uniform(0.15, 0.8))
+        specks = np.random.default_rng(self.lens)
+        for _ in range(self.dust):
+            (across, down), size, cover = specks.uniform(-1, 1, 2), specks.uniform(0.03, 0.2), specks.uniform(0.3, 0.9)
+            speck = cover * np.exp(-((((x - across) ** 2 + (y - down) ** 2) / size**2) ** 2))
+            light = light * (1 - speck) + 0.5 * speck * light.mean()
+        return np.asarray(light, np.float32)
+
+    def _crop(self, image: Image) -> Image:
+        if self.zoom >= 1:
+            return image
+        height, width = image.shape
+        rows, columns = round(height * self.zoom), round(width * self.zoom)
+        top, left = (height - rows) // 2, (width - columns) // 2
+        inner = image[top : top + rows, left : left + columns]
+        return cv2.resize(inner, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.uint8)
+
+
+def draw_look(rng: np.random.Generator) -> CameraLook:
+    """A camera at random, from a good one to a poor one, sometimes dusty, by night, or against the sun."""
+    plain = CameraLook(
+        gamma=float(np.exp(rng.normal(0, 0.3))),
+        toe=float(rng.uniform(-0.3, 0.8)),
+        vignetting=float(rng.choice([0.0, rng.uniform(0.1, 0.6)])),
+        blur_px=float(rng.choice([0.0, rng.uniform(0.4, 1.6)])),
+        noise=float(rng.uniform(0.0, 0.04)),
+        quality=100 if rng.random() < 0.5 else int(rng.integers(25, 90)),
+        zoom=float(rng.choice([1.0, rng.uniform(0.6, 1.0)])),
+        exposure=float(rng.uniform(0.05, 0.25)),
+    )
+    night, hot, dusty = rng.random(3) < SELDOM
+    return replace(
+        plain,
+        noise=float(rng.uniform(0.05, 0.12)) if hot or night else plain.noise,
+        lamps=float(rng.uniform(0.5, 1.0)) if night else 0.0,
+        shadow=0.0 if night else float(rng.uniform(0, 0.5)),
+        glare=0.0 if night else float(rng.choice([0.0, rng.uniform(0.1, 0.5)])),
+        dust=int(rng.integers(1, 12)) if dusty else 0,
+        lens=int(rng.integers(2**31)),
+    )
+
+
+SELDOM = (0.12, 0.12, 0.3)
+"""Chances that a camera sees by night, is hot (thermal noise), or dusty."""
+
+
+def _falloff(height: int, width: int, lost: float) -> np.ndarray:
+    """(height, width) float32 share of the light that arrives, 1 in the middle."""
+    y, x = np.linspace(-1, 1, height, dtype=np.float32), np.linspace(-1, 1, width, dtype=np.float32)
+    return np.float32(1) - np.float32(lost / 2) * (x[None] ** 2 + y[:, None] ** 2)
+
+
+def _compress(image: Image, quality: int) -> Image:
+    _, packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
 class Augmentation:
-    """How strongly views are varied; lengths in metres, angles in degrees, standard deviations unless said."""
+    """How strongly views are varied; lengths in metres, angles in degrees, standard deviations unless said.
+
+    `look` is the chance that an image is taken by another camera, in other light (`draw_look`).
+    """
 
     mirror: float = 0.5
     yaw_deg: float = 3.0
@@ -47,6 +171,7 @@ class Augmentation:
     image_roll_deg: float = 2.0
     image_scale: float = 0.06
     image_shift: float = 0.02
+    look: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +245,8 @@ class ViewMaker:
             input_T_pixel = np.array([[-1.0, 0, width - 1], [0, 1, 0], [0, 0, 1]]) @ input_T_pixel
         if rng is None or self._augmentation is None:
             return standardise(image), input_T_pixel, True
+        if self._augmentation.look and rng.random() < self._augmentation.look:
+            image = replace(draw_look(rng), zoom=1.0).take(image, rng)  # the intrinsics stay
         values, motion = _vary_image(image, rng, self._augmentation)
         return standardise(values * 255), motion @ input_T_pixel, True
 

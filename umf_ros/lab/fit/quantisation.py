@@ -23,10 +23,9 @@ from umf_ros.core.io import atomic_write
 from umf_ros.embedding.inputs import blank_input
 from umf_ros.embedding.local_features import network_size
 from umf_ros.embedding.runtimes import FACTS, OUTPUTS, SUPERS, XFEAT_SHAPE, import_openvino
-from umf_ros.lab.datasets.views import read_frame
+from umf_ros.lab.datasets.views import draw_look, read_frame
 from umf_ros.lab.simulation.camera import Camera
 from umf_ros.lab.simulation.survey import save, shard_plan, survey_world
-from umf_ros.lab.training.prepared_views import draw_look
 from umf_ros.networks.config import XFEAT_OUTPUTS, read_config
 from umf_ros.networks.umf import FlatUmf
 from umf_ros.networks.weights import load_weights

@@ -21,13 +21,12 @@ from umf_ros.baselines.place_network import count_parameters
 from umf_ros.core.frames import Image
 from umf_ros.core.io import atomic_write
 from umf_ros.lab.datasets.sample import Places, Rule, Sample, SampleSequence, places_of
-from umf_ros.lab.datasets.views import Augmentation, ViewMaker
+from umf_ros.lab.datasets.views import Augmentation, CameraLook, ViewMaker, draw_look
 from umf_ros.lab.evaluation.retrieval import NEAR_M
 from umf_ros.lab.simulation.survey import shard_plan, survey_world
 from umf_ros.lab.training.batches import stack_views
 from umf_ros.lab.training.losses import Bank, Relations, neighbourhood_components, relate
 from umf_ros.lab.training.networks import read_card, save_weights
-from umf_ros.lab.training.prepared_views import CameraLook, draw_look
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.efficientnet import DEPTH, STAGES, EfficientNetLite0
 from umf_ros.networks.umf import UMF, channels_last

@@ -154,7 +154,8 @@ class MetricObjective(Objective):
         Raises:
             ConfigError: no place of these sequences is visited twice.
         """
-        settings, augmentation, pairs = self._settings, Augmentation(), self.batch_size // 2
+        settings, pairs = self._settings, self.batch_size // 2
+        augmentation = Augmentation(look=settings.looks)
         if self._sampler is None or self._sampler[0] != len(sequences):  # to find all revisits takes its time
             whole = settings.loss == "neighbourhood"
             self._sampler = len(sequences), PairSampler(sequences, self._rule, augmentation.mirror, whole)

@@ -136,6 +136,9 @@ class MetricSettings(RunSettings):
     modality_dropout: float = Field(
         0.15, ge=0, le=0.5, description="chance of losing the image, and of losing the scan"
     )
+    looks: float = Field(
+        0.5, ge=0, le=1, description="chance that an image is taken by another camera, by night, against the sun ..."
+    )
     branch: Branch = Field(
         "both", description="image or cloud: that branch alone learns, the other one is neither run nor changed"
     )
