@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import weakref
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from recordings import traverse, write_db3
 from umf_ros.core.config import Database, Loop
 from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.places.store import KeyframeStore
+from umf_ros.places.store import KeyframeStore, delete_sessions
 
 IDENTITY = ("test", 16)
 RULES = Loop(min_similarity=-1, min_time_gap_s=20, min_travel_m=15, top_k=50)
@@ -107,6 +108,27 @@ def test_places_added_after_reopening_come_after_the_old_ones(tmp_path: Path) ->
     again = database(path)
     assert [again[i].stamp_ns for i in range(6)] == [0, 10**9, 2 * 10**9, 3 * 10**9, 4 * 10**9, 50 * 10**9]
     assert again.next_session == 3
+
+
+def test_keypoints_of_submaps_are_stored_until_their_keyframes_are_deleted(tmp_path: Path) -> None:
+    path = filled(tmp_path / "places.sqlite")
+    keypoints = np.arange(4 * 130, dtype=np.float32).reshape(4, 130)
+    with closing(store(path)) as kept:
+        kept.add_keypoints(2, keypoints)
+        kept.add_keypoints(3, keypoints[:0])
+    with closing(store(path)) as again:
+        assert {row: found.tolist() for row, found in again.keypoints().items()} == {2: keypoints.tolist(), 3: []}
+        numbers = again.keys["session"].tolist()
+    delete_sessions(path, set(numbers))
+    with closing(store(path)) as emptied:
+        assert emptied.keypoints() == {}
+
+
+def test_a_file_without_submaps_is_read(tmp_path: Path) -> None:
+    path = filled(tmp_path / "places.sqlite")
+    change(path, "DROP TABLE submap")
+    with closing(KeyframeStore(path, IDENTITY, 20, read_only=True)) as old:
+        assert len(old) == 5 and old.keypoints() == {}
 
 
 def test_the_least_recently_used_keyframe_leaves_the_cache() -> None:

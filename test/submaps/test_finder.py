@@ -12,6 +12,7 @@ from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.core.geometry import invert, make_pose, relative, rotation_angle
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps import SubmapFinder
+from umf_ros.submaps.history import SubmapHistory
 from umf_ros.verification import Hypothesis, RejectReason
 from umf_ros.verification import constants as const
 
@@ -166,6 +167,7 @@ def test_a_stored_session_is_found_by_one_driven_the_other_way(
     half, closed = len(outing.keyframes) // 2, 0
     for keyframe in outing.keyframes[:half]:  # stamps of a map may be later than the present
         database.add(replace(keyframe, stamp_ns=keyframe.stamp_ns + localizing * DAY_NS))
+    SubmapHistory(database.store).describe(0)
     finder = SubmapFinder(Verification(), Loop(), database, range(1) if localizing else None)
     start, path_m = outing.keyframes[half].odom_T_body, outing.keyframes[half].path_length_m
     assert start is not None
@@ -193,7 +195,7 @@ def test_a_place_found_from_afar_is_exchanged_for_the_nearest(outing: Drive, dat
     finder = SubmapFinder(Verification(), Loop(), database, range(1))
     queries = [replace(one, session=1) for one in outing.keyframes[half : half + 25]]
     for one in queries[:-1]:
-        finder.remember(one, described=0)
+        finder.remember(one)
     query, true = queries[-1], outing.truth[half + 24]
     assert abs(outing.truth[far][0, 3] - true[0, 3]) > 8
     place = Candidate(far, database[far].stamp_ns, 1.0)
@@ -203,3 +205,25 @@ def test_a_place_found_from_afar_is_exchanged_for_the_nearest(outing: Drive, dat
     assert match is not None and verdicts[0].closure is closure
     assert np.linalg.norm(closure.match_T_query[:3, 3]) < const.SAME_PLACE_M
     assert np.linalg.norm((relative(outing.truth[match], true) @ invert(closure.match_T_query))[:3, 3]) < 0.5
+
+
+def test_a_place_too_far_away_is_exchanged_for_one_halfway_where_the_nearest_is_unknown(
+    outing: Drive, database: PlaceDatabase
+) -> None:
+    half = len(outing.keyframes) // 2
+    query, true = replace(outing.keyframes[half + 24], session=1), outing.truth[half + 24]
+    for keyframe, pose in zip(outing.keyframes[:half], outing.truth, strict=False):
+        if abs(pose[0, 3] - true[0, 3]) > 1.2 * const.SAME_PLACE_M:
+            database.add(keyframe)
+    finder = SubmapFinder(Verification(), Loop(), database, range(1))
+    for one in outing.keyframes[half : half + 24]:
+        finder.remember(replace(one, session=1))
+    far = next(row for row in range(len(database)) if true[0, 3] - outing.truth[row][0, 3] < 14)
+    place = Candidate(far, database[far].stamp_ns, 1.0)
+    verdicts = finder.find(query, [Hypothesis(query.stamp_ns, place, probability=0.5)])
+    (closure,) = [one.closure for one in verdicts if one.closure is not None]
+    shift_m = float(np.linalg.norm(closure.match_T_query[:3, 3]))
+    assert const.SAME_PLACE_M < shift_m < Verification().max_shift_m < abs(outing.truth[far][0, 3] - true[0, 3])
+    stamps = [keyframe.stamp_ns for keyframe in outing.keyframes]
+    match = outing.truth[stamps.index(closure.match_stamp_ns)]
+    assert np.linalg.norm((relative(match, true) @ invert(closure.match_T_query))[:3, 3]) < 0.5

@@ -47,6 +47,7 @@ from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, closure_row
 from umf_ros.runs.writer import PLACES, count_drops
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.submaps import SubmapFinder
+from umf_ros.submaps.history import SubmapHistory
 from umf_ros.verification import Hypothesis, Verifier
 
 OnFrame = Callable[[float, Detection], None]
@@ -214,6 +215,9 @@ def add_places(
         for one in known:
             stamp_ns, number = one.stamp_ns + shift_ns, one.session + first_number
             places.add(replace(one, stamp_ns=stamp_ns, session=number))
+        submaps = SubmapHistory(places.store)
+        for number in range(first_number, places.next_session):
+            submaps.describe(number)
         session = MapSession(
             name=name,
             recording=recording,
@@ -251,7 +255,7 @@ def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Hypot
             candidates = places.query(keyframe, settings.loop, earlier)
             verdicts = verifier.verify(keyframe, [(found, places[found.index]) for found in candidates])
             verdicts = submaps.find(keyframe, verdicts)
-            submaps.remember(keyframe, described=len(places))
+            submaps.remember(keyframe)
             found_rows += [closure_row(v.closure, v.candidate.similarity) for v in verdicts if v.closure]
             yield verdicts
     write_table(target.folder_of(session.name) / BETWEEN, CLOSURES, found_rows)

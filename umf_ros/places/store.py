@@ -33,6 +33,7 @@ SCHEMA = Schema(
         ),
         # covers the keys of all keyframes on a hundredth of the pages
         ("CREATE INDEX IF NOT EXISTS keyframe_by_stamp ON keyframe (stamp_ns, session, travelled_m)",),
+        ("CREATE TABLE submap (id INTEGER PRIMARY KEY, keypoints BLOB NOT NULL)",),
     ),
 )
 OUTBOX = Schema(
@@ -148,6 +149,22 @@ class KeyframeStore:
             self._count += 1
             self._remember(row, keyframe)
             return self._count - 1
+
+    def add_keypoints(self, index: int, keypoints: NDArray[np.float32]) -> None:
+        """Store the keypoints (K, 130) of the submap around a keyframe, in half precision."""
+        row = int(self.keys["id"][index]), keypoints.astype(np.float16).tobytes()
+        with self._lock, self._file.writing() as connection:
+            connection.execute("INSERT OR REPLACE INTO submap VALUES (?, ?)", row)
+
+    def keypoints(self) -> dict[int, NDArray[np.float32]]:
+        """Return the stored keypoints (K, 130) by the index of their keyframe; none of a file of an earlier release."""
+        with self._reading() as connection:
+            if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'submap'").fetchone():
+                return {}
+            found = dict(connection.execute("SELECT id, keypoints FROM submap"))
+            rows = np.searchsorted(self.keys["id"], list(found)).tolist()
+            stored = [np.frombuffer(blob, np.float16).reshape(-1, 130).astype(np.float32) for blob in found.values()]
+            return dict(zip(rows, stored, strict=True))
 
     @property
     def store_id(self) -> UUID:
@@ -295,7 +312,9 @@ def delete_sessions(path: Path, numbers: Collection[int]) -> int:
     with closing(SqliteFile(path, SCHEMA)) as file, file.writing() as connection:
         index_path(path).unlink(missing_ok=True)
         statement = "DELETE FROM keyframe WHERE session = ?"
-        return sum(connection.execute(statement, (number,)).rowcount for number in set(numbers))
+        deleted = sum(connection.execute(statement, (number,)).rowcount for number in set(numbers))
+        connection.execute("DELETE FROM submap WHERE id NOT IN (SELECT id FROM keyframe)")  # ids are used again
+        return deleted
 
 
 def index_path(path: Path) -> Path:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
 
 import numpy as np
 
 from umf_ros.core.config import Loop, Verification
 from umf_ros.core.frames import Candidate, Keyframe
-from umf_ros.core.geometry import Array, relative
+from umf_ros.core.geometry import Array, relative, transform
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.submaps.history import SubmapHistory
+from umf_ros.submaps.history import SubmapHistory, can_be_merged
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
-from umf_ros.verification.keypoints import Keypoints, most_alike
-from umf_ros.verification.prepared_scan import PreparedScan
+from umf_ros.verification.keypoints import most_alike
 from umf_ros.verification.verifier import NO_GUESSES
+
+Places = list[tuple[Candidate, Array]]
+"""Places with `match_T_query` (4, 4) as odometry has it, the likeliest first."""
 
 
 class SubmapFinder:
@@ -45,10 +46,6 @@ class SubmapFinder:
         self._rules, self._database, self._sessions = rules, database, sessions
         self._verifier = Verifier(settings)
         self.history = SubmapHistory(database.store)
-        self._keypoints: dict[int, Keypoints] = {}
-        stored = np.unique(database.store.keys["session"]).tolist() if sessions is None else sessions
-        rows = (self.history.rows(session, 0.0, np.inf)[:: const.DESCRIBED_EVERY].tolist() for session in stored)
-        self._stored: list[int] = list(chain.from_iterable(rows))
         self.reset()
 
     def retune(self, settings: Verification, rules: Loop) -> None:
@@ -59,7 +56,6 @@ class SubmapFinder:
     def reset(self) -> None:
         """Forget what was found lately; the places stay."""
         self._latest: tuple[Keyframe, Keyframe, Array] | None = None
-        self._described_m = 0.0
         self._verifier.reset()
         self.history.reset()
 
@@ -72,20 +68,22 @@ class SubmapFinder:
             query: the newest keyframe, not yet remembered.
             verdicts: about its scan.
         """
-        if self._note_closures(query, verdicts) or not self.history.needed or query.odom_T_body is None:
+        asked = self.history.needed or self.history.keypoints
+        if self._note_closures(query, verdicts) or not asked or not can_be_merged(query):
             return list(verdicts)
         expected = self._expected(query)
-        candidates = self._candidates(query, verdicts, expected)
-        guesses = NO_GUESSES if expected is None else {self._database[expected[0]].stamp_ns: expected[1]}
-        compared = self._point_to_nearest(query, self.compare(query, candidates, guesses))
+        guesses = {candidate.stamp_ns: pose for candidate, pose in expected[:1]}
+        compared = self.compare(query, self._candidates(query, verdicts, expected[:1]), guesses)
+        compared = self._point_to_nearest(query, compared)
+        if not any(one.accepted for one in compared):
+            compared = _joined(self._compare_in_turn(query, expected[1:]), compared)
         self._note_closures(query, compared)
-        known = {one.candidate.stamp_ns for one in compared}
-        return compared + [one for one in verdicts if one.candidate.stamp_ns not in known]
+        return _joined(compared, verdicts)
 
     def compare(
         self, query: Keyframe, candidates: Sequence[Candidate], guesses: Mapping[int, Array] = NO_GUESSES
     ) -> list[Hypothesis]:
-        """One verdict for each candidate whose submap can be compared with that of a keyframe.
+        """One verdict for each candidate that has a submap, or is compared with that of the keyframe.
 
         Args:
             query: the newest keyframe.
@@ -98,33 +96,15 @@ class SubmapFinder:
             if match.session == query.session:  # scans that both submaps hold are alike for no other reason
                 last_m = (match.path_length_m + query.path_length_m) / 2
                 first_m = max(first_m, last_m)
-            pairs.append((candidate, self.history.around(candidate.index, last_m) or match))
-        submap = self.history.before(query, first_m) if pairs else None
-        if submap is None:
-            return []
-        return self._verifier.verify(submap, pairs, guesses)
+            pairs.append((candidate, match, self.history.around(candidate.index, last_m)))
+        own = self.history.before(query, first_m) if pairs else None
+        merged = [(candidate, around or match) for candidate, match, around in pairs if own or around]
+        return self._verifier.verify(own or query, merged, guesses) if merged else []
 
-    def remember(self, keyframe: Keyframe, described: int = 1) -> None:
-        """Take up a keyframe that was added to the database; one without a scan adds nothing to a submap.
-
-        Args:
-            keyframe: the newest one.
-            described: most submaps stored before that are described now, at a tenth of a second each.
-        """
-        if self.history.add(keyframe) and self.history.needed:
-            self._describe(keyframe, described)
-
-    def _describe(self, newest: Keyframe, stored: int) -> None:
-        """Describe the submap that the newest keyframe completes, and some that were stored before."""
-        complete_m = newest.path_length_m - const.ODOMETRY_REACH_M
-        rows = self.history.rows(newest.session, self._described_m, complete_m)[:1].tolist()
-        if rows:
-            described = self._database[rows[0]]
-            self._described_m = described.path_length_m + const.DESCRIBED_EVERY * const.MERGE_STEP_M
-        rows += [self._stored.pop() for _ in range(min(stored, len(self._stored)))]
-        for row in rows:
-            if (submap := self.history.around(row)) is not None:
-                self._keypoints[row] = PreparedScan.of(submap).keypoints
+    def remember(self, keyframe: Keyframe) -> None:
+        """Take up a keyframe that was added to the database; one without a scan adds nothing to a submap."""
+        if self.history.add(keyframe) and self.history.needed and not self._database.store.read_only:
+            self.history.describe(keyframe.session, keyframe.path_length_m - const.ODOMETRY_REACH_M, 1)
 
     def _note_closures(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> bool:
         """Whether there are closures; odometry carries the last of them on to the next keyframes."""
@@ -133,26 +113,28 @@ class SubmapFinder:
             self._latest = query, self._database[index], closure.match_T_query
         return bool(closures)
 
-    def _expected(self, query: Keyframe) -> tuple[int, Array] | None:
-        """Row of the nearest keyframe where odometry puts the rover, and `match_T_query` there; None without one."""
-        found = (self._nearest(query, *prediction) for prediction in self._predictions(query))
-        return next((one for one in found if one is not None), None)
+    def _expected(self, query: Keyframe) -> Places:
+        """Places where odometry puts the rover; empty without any."""
+        return next((found for one in self._predictions(query) if (found := self._places(query, *one))), [])
 
-    def _nearest(
-        self, query: Keyframe, session: int, odom_T_query: Array, first_m: float, last_m: float
-    ) -> tuple[int, Array] | None:
-        """Row nearest to a pose on a part of a session's path, and `match_T_query` there; None where none is near."""
+    def _places(self, query: Keyframe, session: int, odom_T_query: Array, first_m: float, last_m: float) -> Places:
+        """Places near a pose, and halfway from there to what the query sees, on a part of a session's path."""
         rows = self.history.rows(session, first_m, last_m)
         rows = rows[self._database.admissible(query, self._rules, self._sessions, rows)]
-        poses = [relative(self.history.odometry(row), odom_T_query) for row in rows.tolist()]
-        away = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
-        if not away or min(away) >= const.SAME_PLACE_M:
-            return None
-        best = int(np.argmin(away))
-        return int(rows[best]), poses[best]
+        found: dict[int, Array] = {}
+        for place in transform(odom_T_query, np.outer([0.0, 0.5], np.median(query.points, axis=0))):
+            away = [float(np.linalg.norm(self.history.odometry(row)[:3, 3] - place)) for row in rows.tolist()]
+            if away and min(away) < const.SAME_PLACE_M:
+                best = int(rows[np.argmin(away)])
+                found[best] = relative(self.history.odometry(best), odom_T_query)
+        return [(self._candidate(query, row), pose) for row, pose in found.items()]
 
     def _point_to_nearest(self, query: Keyframe, verdicts: list[Hypothesis]) -> list[Hypothesis]:
-        """Return the verdicts, one found from afar replaced where the place nearest to its pose is found there too."""
+        """Return the verdicts, one found from afar replaced where the place nearest to its pose is found there too.
+
+        One from too far is else replaced by the place halfway to what the query sees, with which a narrow sensor that
+        drives against the direction of the match shares more.
+        """
         for far in verdicts:
             if not (far.accepted or far.reason is RejectReason.TOO_FAR):
                 continue
@@ -160,15 +142,21 @@ class SubmapFinder:
             if match.odom_T_body is None or shift_m < const.SAME_PLACE_M:
                 continue
             reach = match.path_length_m - const.ODOMETRY_REACH_M, match.path_length_m + const.ODOMETRY_REACH_M
-            found = self._nearest(query, match.session, match.odom_T_body @ far.pose, *reach)
-            if found is None:
-                continue
-            nearest = self._candidate(query, found[0])
-            compared = self.compare(query, [nearest], {nearest.stamp_ns: found[1]})
+            places = self._places(query, match.session, match.odom_T_body @ far.pose, *reach)
+            compared = self._compare_in_turn(query, places[:1] if far.accepted else places)
             if any(one.accepted for one in compared):
                 far.reject(RejectReason.LESS_PROBABLE)
-                return compared + [one for one in verdicts if one.candidate.index != nearest.index]
+                return _joined(compared, verdicts)
         return verdicts
+
+    def _compare_in_turn(self, query: Keyframe, places: Places) -> list[Hypothesis]:
+        """Verdicts about places, up to the first that is found, the last one first."""
+        compared: list[Hypothesis] = []
+        for candidate, pose in places:
+            compared = self.compare(query, [candidate], {candidate.stamp_ns: pose}) + compared
+            if any(one.accepted for one in compared):
+                break
+        return compared
 
     def _predictions(self, query: Keyframe) -> Iterator[tuple[int, Array, float, float]]:
         """Session, pose of the query in its odometry, and the part of the path where that is trusted.
@@ -185,14 +173,11 @@ class SubmapFinder:
                 yield match.session, where, match.path_length_m - reach_m, match.path_length_m + reach_m
         yield query.session, now, query.path_length_m - const.ODOMETRY_ALONE_M, query.path_length_m
 
-    def _candidates(
-        self, query: Keyframe, verdicts: Sequence[Hypothesis], expected: tuple[int, Array] | None
-    ) -> list[Candidate]:
+    def _candidates(self, query: Keyframe, verdicts: Sequence[Hypothesis], expected: Places) -> list[Candidate]:
         """Candidates worth a comparison, no place twice."""
         found = [one.candidate for one in verdicts if (one.probability or 0.0) >= const.PROMISING]
-        if expected is not None:
-            found.append(self._candidate(query, expected[0]))
-        else:
+        found += [candidate for candidate, _ in expected]
+        if not expected:
             found += [verdicts[0].candidate] if verdicts else []
             found += [self._candidate(query, row) for row in self._look_alike(query)]
         return list({candidate.index: candidate for candidate in found}.values())
@@ -202,15 +187,19 @@ class SubmapFinder:
         return Candidate(row, match.stamp_ns, float(query.embedding.descriptor @ match.embedding.descriptor))
 
     def _look_alike(self, query: Keyframe) -> list[int]:
-        """Rows of the database whose submaps share most keypoints with that of a keyframe."""
-        submap = self.history.before(query)
-        if submap is None:
-            return []
-        rows = np.array(list(self._keypoints), np.intp)
+        """Rows of the database whose submaps share most keypoints with that of a keyframe, or with its scan."""
+        submap = self.history.before(query) or query
+        rows = np.array(list(self.history.keypoints), np.intp)
         rows = rows[self._database.admissible(query, self._rules, self._sessions, rows)]
         keys = self._database.store.keys[rows]
         # scans that both submaps hold are alike for no other reason
         first_m = query.path_length_m - 2 * const.ODOMETRY_REACH_M
         apart = (keys["session"] != query.session) | (keys["travelled_m"] < first_m)
-        described = {row: self._keypoints[row] for row in rows[apart].tolist()}
+        described = {row: self.history.keypoints[row] for row in rows[apart].tolist()}
         return most_alike(self._verifier.scans[submap].keypoints, described)[: const.LOOKALIKES]
+
+
+def _joined(first: list[Hypothesis], others: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Verdicts, and others about candidates that these say nothing about."""
+    known = {one.candidate.stamp_ns for one in first}
+    return first + [one for one in others if one.candidate.stamp_ns not in known]

@@ -169,6 +169,7 @@ class SubmapHistory:
 
     Attributes:
         needed: whether single scans of this session show too little of a place.
+        keypoints: of submaps by the row of their keyframe, of every third metre; those of a stored file are read.
     """
 
     def __init__(self, store: KeyframeStore) -> None:
@@ -176,6 +177,8 @@ class SubmapHistory:
         self._odometry: dict[int, Array] = {}
         self._drifts: dict[int, DriftMeter] = {}
         self._submaps: OrderedDict[tuple[int, int], Keyframe] = OrderedDict()
+        self.keypoints = store.keypoints()
+        self._described = set(self.keypoints)
         self.reset()
 
     def reset(self) -> None:
@@ -195,6 +198,21 @@ class SubmapHistory:
             self._drifts.setdefault(keyframe.session, DriftMeter()).add(keyframe, before)
         self._recent = [keyframe, *before]
         return True
+
+    def describe(self, session: int, complete_m: float = np.inf, most: int | None = None) -> None:
+        """Find and store the keypoints of submaps of a session, of every third metre of its path.
+
+        Args:
+            session: whose keyframes are stored.
+            complete_m: where on its path submaps are complete.
+            most: submaps that are described now, a tenth of a second each; None: all.
+        """
+        rows = self.rows(session, -np.inf, complete_m)[:: const.DESCRIBED_EVERY].tolist()
+        for row in [one for one in rows if one not in self._described][:most]:
+            self._described.add(row)
+            if (submap := self.around(row)) is not None:
+                self.keypoints[row] = PreparedScan.of(submap).keypoints
+                self.store.add_keypoints(row, self.keypoints[row])
 
     def rows(self, session: int, first_m: float, last_m: float) -> Rows:
         """Rows of the database on a part of a session's path, in its order, one of every 1.5 m."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -14,18 +13,8 @@ from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 from umf_ros.verification.rerank import mutual_neighbours
 
-
-@dataclass(frozen=True, slots=True)
-class Keypoints:
-    """K keypoints, strongest first.
-
-    Attributes:
-        places: (K, 2) float32 m, upright body frame, seen from above.
-        descriptors: (K, 128) float32 unit vectors that do not depend on the heading.
-    """
-
-    places: NDArray[np.float32]
-    descriptors: NDArray[np.float32]
+Keypoints = NDArray[np.float32]
+"""(K, 130), strongest first: x and y in m in the upright body frame, and a unit vector that no heading changes."""
 
 
 def find_keypoints(relief: NDArray[np.float32]) -> Keypoints:
@@ -37,26 +26,26 @@ def find_keypoints(relief: NDArray[np.float32]) -> Keypoints:
     detector = cv2.SIFT.create(const.KEYPOINTS, 3, const.KEYPOINT_CONTRAST, 20, 1.0)
     found, descriptors = detector.detectAndCompute(picture, inner)
     if descriptors is None:
-        return Keypoints(np.empty((0, 2), np.float32), np.empty((0, 128), np.float32))
+        return np.empty((0, 130), np.float32)
     order = np.argsort([-one.response for one in found], kind="stable")[: const.KEYPOINTS]
     pixels = np.array([found[i].pt[::-1] for i in order])
     places = (pixels + 0.5 - np.array(relief.shape) / 2) * const.TERRAIN_CELL_M
     share = descriptors[order] / np.maximum(descriptors[order].sum(axis=1, keepdims=True), 1e-6)
-    return Keypoints(places.astype(np.float32), np.sqrt(share).astype(np.float32))
+    return np.hstack([places, np.sqrt(share)]).astype(np.float32)
 
 
 def common_keypoints(query: Keypoints, match: Keypoints) -> tuple[int, float, Array]:
     """How many keypoints one planar motion takes from the query to the match, rad and (2,) m; 0 without a motion."""
     nothing = 0, 0.0, np.zeros(2)
-    if min(len(query.places), len(match.places)) < const.MIN_KEYPOINTS:
+    if min(len(query), len(match)) < const.MIN_KEYPOINTS:
         return nothing
-    here, there = mutual_neighbours(query.descriptors @ match.descriptors.T).T
+    here, there = mutual_neighbours(query[:, 2:] @ match[:, 2:].T).T
     if len(here) < const.MIN_KEYPOINTS:
         return nothing
     cv2.setRNGSeed(0)
     reach_m = 2 * const.TERRAIN_CELL_M
     motion, inliers = cv2.estimateAffinePartial2D(
-        query.places[here], match.places[there], ransacReprojThreshold=reach_m, maxIters=300
+        query[here, :2], match[there, :2], ransacReprojThreshold=reach_m, maxIters=300
     )
     if motion is None or abs(float(np.hypot(motion[0, 0], motion[1, 0])) - 1) > const.KEYPOINT_SCALE:
         return nothing
@@ -65,7 +54,7 @@ def common_keypoints(query: Keypoints, match: Keypoints) -> tuple[int, float, Ar
 
 def most_alike(query: Keypoints, submaps: Mapping[int, Keypoints]) -> list[int]:
     """Names of the submaps that share most keypoints with the query's, best first; its keypoints vote for some."""
-    if len(query.places) < const.MIN_KEYPOINTS or not submaps:
+    if len(query) < const.MIN_KEYPOINTS or not submaps:
         return []
     names, votes = list(submaps), _votes(query, list(submaps.values()))
     chosen = [names[one] for one in np.argsort(-votes, kind="stable")[: const.SUBMAPS_COMPARED] if votes[one] > 0]
@@ -75,14 +64,14 @@ def most_alike(query: Keypoints, submaps: Mapping[int, Keypoints]) -> list[int]:
 
 def _votes(query: Keypoints, submaps: list[Keypoints]) -> NDArray[np.float32]:
     """(S,) for every submap: by how much its keypoints are more like the query's than most others'."""
-    similarity = query.descriptors @ np.concatenate([one.descriptors for one in submaps]).T
-    owner = np.repeat(np.arange(len(submaps)), [len(one.places) for one in submaps])
+    similarity = query[:, 2:] @ np.concatenate(submaps)[:, 2:].T
+    owner = np.repeat(np.arange(len(submaps)), [len(one) for one in submaps])
     if not len(owner):  # ground on which nothing stands out
         return np.zeros(len(submaps), np.float32)
     kept = min(const.KEYPOINT_VOTES, similarity.shape[1] - 1)
     best = np.argpartition(-similarity, kept, axis=1)[:, : kept + 1]
     value = np.take_along_axis(similarity, best, axis=1)
-    votes = np.zeros((len(query.places), len(submaps)), np.float32)
+    votes = np.zeros((len(query), len(submaps)), np.float32)
     np.maximum.at(votes, (np.arange(len(votes))[:, None], owner[best]), value - value.min(axis=1, keepdims=True))
     total: NDArray[np.float32] = votes.sum(axis=0)
     return total
