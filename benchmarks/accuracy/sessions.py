@@ -159,7 +159,7 @@ def wrong_closures(joint: JointMap, truths: dict[str, Trajectory], closures: lis
 
 
 def overlapping_apart(joint: JointMap, truths: dict[str, Trajectory]) -> int:
-    """Pairs of sessions that see the same way for 20 m or more, of which one is not in the map."""
+    """Pairs of sessions that drive the same way for 20 m or more, of which one is not in the map."""
     joined = {one.session.name: one.joined for one in joint.sessions}
     names = list(joined)
     pairs = [(a, b) for i, a in enumerate(names) for b in names[:i] if not (joined[a] and joined[b])]
@@ -167,8 +167,8 @@ def overlapping_apart(joint: JointMap, truths: dict[str, Trajectory]) -> int:
 
 
 def shared_m(one: Trajectory, other: Trajectory) -> float:
-    """Metres of the one's way on which the other was near and looked the same way."""
-    again = sees_again(one.poses, other.poses)
+    """Metres of the one's way on which the other was near and looked the same way, or the opposite one."""
+    again = sees_again(one.poses, other.poses) | sees_again(one.poses, other.poses, np.pi)
     steps = np.linalg.norm(np.diff(one.poses[:, :3, 3], axis=0), axis=1)
     return float(steps[again[1:]].sum())
 
