@@ -224,12 +224,11 @@ def _messages(records: bytes, channels: Container[int]) -> Iterator[tuple[int, i
     while end < len(records):
         opcode, length = _RECORD_HEAD.unpack_from(records, end)
         place, end = end, end + _RECORD_HEAD.size + length
-        if end > len(records):
-            raise EOFError("a record lies beyond the end of its chunk")
         if opcode == Opcode.MESSAGE:
-            channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(records, place + _RECORD_HEAD.size)
+            start = place + _RECORD_HEAD.size
+            channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(records, start)
             if channel in channels:
-                yield place, channel, log_ns, records[place + _RECORD_HEAD.size + _MESSAGE_HEAD.size : end]
+                yield place, channel, log_ns, records[start + _MESSAGE_HEAD.size : end]
 
 
 def _checked(chunk: Chunk) -> Chunk:

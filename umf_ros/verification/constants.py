@@ -111,6 +111,7 @@ PASSAGE_COMMON = 0.25  # by hand: of the compared points that a rival needs
 # among the rivals of a wrong one
 PASSAGE_SHIFTS_M = np.arange(-15.0, 15.1, 0.25)
 PASSAGE_RIVALS = 16  # by hand: of these poses, that are aligned
+PASSAGE_SAME_M = 0.1  # measured: alignments that end so near each other count once; .25 m moves verdicts
 # measured on validation passages: log of the ratio of misfits, and standard deviations, the larger near the identity
 PASSAGE_LEAD, PASSAGE_SIGMAS, PATTERN_SIGMAS = 0.12, 1.6, 2.4
 

@@ -209,7 +209,12 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
         return None
     along = shifted(pose, way, const.PASSAGE_SHIFTS_M)
     best = along[_peaks(_means(*_misfits(match, query, along, const.SCOUT_EVERY)))]
-    aligned = [run_gicp(match, query.sample_cloud, one, const.FINE_REACH_M) for one in best]
+    distinct: list[tuple[Array, Array]] = []
+    for one in best:  # half of them end where another does: a few points show it
+        end = run_gicp(match, query.scouts_cloud, one, const.FINE_REACH_M)
+        if not any(near(end, other, const.PASSAGE_SAME_M, np.pi) for _, other in distinct):
+            distinct.append((one, end))
+    aligned = [run_gicp(match, query.sample_cloud, one, const.FINE_REACH_M) for one, _ in distinct]
     poses = np.stack([pose, *aligned, *best])  # alignments may all end at one pose
     misfits, known = _misfits(match, query, poses)
     means = _means(misfits, known)
