@@ -312,7 +312,7 @@ class LoopDetector:
     def close(self) -> None:
         """Disconnect from the fleet's server, and release the database, the network and the scans."""
         self._network.shutdown(cancel_futures=True)
-        del self._embedder
+        vars(self).pop("_embedder", None)
         self._verifier.reset()
         if self.inter_robot is not None:
             self.inter_robot.link.close()
