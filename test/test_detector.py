@@ -142,6 +142,12 @@ def test_the_same_frames_give_the_same_verdicts_bit_for_bit(frames: list[Frame],
             np.testing.assert_array_equal(a.covariance, b.covariance)
 
 
+def test_closing_twice_is_harmless() -> None:
+    found = detector()
+    found.close()
+    found.close()
+
+
 def test_a_standing_rover_makes_no_keyframes(frames: list[Frame]) -> None:
     found = detector()
     still = [replace(frames[0], stamp_ns=frames[0].stamp_ns + i * 10**7) for i in range(20)]
