@@ -6,7 +6,6 @@ A folder or file that cannot be written raises an `OutputError`.
 from __future__ import annotations
 
 import json
-import resource
 import time
 from array import array
 from collections.abc import Mapping
@@ -188,7 +187,7 @@ class RunRecorder(RunFile):
             "latency_ms": {stage: _percentiles(values) for stage, values in self._latency.items()},
             "drops": dict(drops),
             "realtime_factor": round(self._recorded_ns * 1e-9 / max(elapsed_s, 1e-9), 3),
-            "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            "peak_rss_mb": round(peak_memory_mb(), 1),
             "seed": self._settings.verification.seed,
             "version": __version__,
             "weights": self._weights,
@@ -262,6 +261,12 @@ def read_summary(folder: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or "closures_published" not in content:
         raise UmfError(f"{path} is not a summary of a run")
     return content
+
+
+def peak_memory_mb() -> float:
+    """Return the peak resident memory of this process; `getrusage` would count that of the process that started it."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
 
 
 def _percentiles(values: array[float]) -> dict[str, float | None]:
