@@ -24,7 +24,7 @@ COMMANDS = {
     "replay": "umf_ros.commands.replay",
     "map": "umf_ros.commands.map:app",
     "compare": "umf_ros.lab.commands.compare",
-    "sensors": "umf_ros.lab.commands.inspect:sensors",
+    "sensors": "umf_ros.lab.commands.evaluate:sensors",
     "play": "umf_ros.lab.commands.demo:play",
     "report": "umf_ros.lab.commands.report",
     "evaluate": "umf_ros.lab.commands.evaluate",
