@@ -158,7 +158,8 @@ class LoopDetector:
         small_gicp.PointCloud(np.eye(3))  # its binding must be initialised before there are other threads
         self._rules = settings.loop
         self._selector = KeyframeSelector(settings.keyframe)
-        self._embedder, self.embedder_name = embedder, embedder.name
+        self._embedder: Embedder | None = embedder
+        self.embedder_name = embedder.name
         self._verifier = Verifier(settings.verification)
         identity = embedder.name, embedder.dimension
         if settings.localizing:
@@ -260,6 +261,7 @@ class LoopDetector:
 
     def _embed_timed(self, frame: Frame) -> tuple[Embedding, float]:
         start = time.perf_counter()
+        assert self._embedder is not None, "the detector is closed"
         embedding = lift(frame, self._embedder.embed(frame))
         return embedding, 1e3 * (time.perf_counter() - start)
 
@@ -312,7 +314,7 @@ class LoopDetector:
     def close(self) -> None:
         """Disconnect from the fleet's server, and release the database, the network and the scans."""
         self._network.shutdown(cancel_futures=True)
-        vars(self).pop("_embedder", None)
+        self._embedder = None
         self._verifier.reset()
         if self.inter_robot is not None:
             self.inter_robot.link.close()

@@ -7,7 +7,7 @@ import heapq
 import re
 import struct
 from collections import Counter
-from collections.abc import Collection, Container, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import chain
@@ -17,10 +17,9 @@ from typing import Any
 import lz4.frame
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, ChunkIndex, Message, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
+from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
@@ -101,8 +100,6 @@ def unpack(compression: str, data: bytes) -> bytes:
 # exceptions of the mcap library and the decompressors on damaged data
 _DAMAGE = (McapError, struct.error, ZstdError, ValueError, RuntimeError, EOFError, LookupError, TypeError, MemoryError)
 
-_RECORD_HEAD, _MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
-"""Opcode and length of a record; channel, sequence, time of recording and of publishing of a message."""
 _CHUNK_HEAD = 64
 """Bytes at the start of a chunk's record that hold its stated size, compression included."""
 
@@ -169,10 +166,11 @@ class McapFile:
                 if index.message_index_offsets and not wanted.keys() & index.message_index_offsets.keys():
                     continue
                 stream.seek(index.chunk_start_offset + 9)
-                records, size = get_chunk_data_stream(_checked(Chunk.read(ReadDataStream(stream))))
-                for place, channel, log_ns, data in _messages(records.read(size), wanted):
-                    message = RawMessage(wanted[channel][0], log_ns, wanted[channel][1], data)
-                    yield index.message_start_time, (index.chunk_start_offset, place), message
+                for number, record in enumerate(_unpacked(Chunk.read(ReadDataStream(stream)))):
+                    if isinstance(record, Message) and record.channel_id in wanted:
+                        topic, kind = wanted[record.channel_id]
+                        message = RawMessage(topic, record.log_time, kind, record.data)
+                        yield index.message_start_time, (index.chunk_start_offset, number), message
 
     def _read_sequentially(self, topics: Collection[str]) -> Iterator[PlacedMessage]:
         for number, message in enumerate(self._stream()):
@@ -188,7 +186,7 @@ class McapFile:
                 limit = min(self._path.stat().st_size, LARGEST_CHUNK)
                 records = StreamReader(stream, emit_chunks=True, record_size_limit=limit).records
                 for record in chain.from_iterable(
-                    breakup_chunk(_checked(one)) if isinstance(one, Chunk) else [one] for one in records
+                    _unpacked(one) if isinstance(one, Chunk) else [one] for one in records
                 ):
                     if isinstance(record, Schema):
                         schemas[record.id] = record
@@ -218,24 +216,12 @@ def _in_order(messages: Iterable[PlacedMessage]) -> Iterator[RawMessage]:
         yield heapq.heappop(waiting)[2]
 
 
-def _messages(records: bytes, channels: Container[int]) -> Iterator[tuple[int, int, int, bytes]]:
-    """Yield place, channel, time of recording in ns and data of the messages of some channels in a chunk's records."""
-    end = 0
-    while end < len(records):
-        opcode, length = _RECORD_HEAD.unpack_from(records, end)
-        place, end = end, end + _RECORD_HEAD.size + length
-        if opcode == Opcode.MESSAGE:
-            start = place + _RECORD_HEAD.size
-            channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(records, start)
-            if channel in channels:
-                yield place, channel, log_ns, records[start + _MESSAGE_HEAD.size : end]
-
-
-def _checked(chunk: Chunk) -> Chunk:
-    """Return a chunk that can be unpacked; raise a `ValueError` if it is larger than `LARGEST_CHUNK`."""
+def _unpacked(chunk: Chunk) -> Iterable[McapRecord]:
+    """Return the records of a chunk; raise a `ValueError` if it is larger than `LARGEST_CHUNK`."""
     _check_chunk(chunk.uncompressed_size, chunk.compression, chunk.data[:18])
-    unpacked = chunk.compression == "lz4"
-    return replace(chunk, compression="", data=unpack("lz4", chunk.data)) if unpacked else chunk
+    if chunk.compression == "lz4":
+        chunk = replace(chunk, compression="", data=unpack("lz4", chunk.data))
+    return breakup_chunk(chunk)
 
 
 def _check_chunks(path: Path, indexes: Collection[ChunkIndex]) -> None:

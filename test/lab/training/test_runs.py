@@ -24,7 +24,7 @@ from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.lab.training.metric_objective import MetricObjective, describe, figures, mean_of, validate
 from umf_ros.lab.training.networks import PRESETS, make_network, read_card, save_weights
 from umf_ros.lab.training.objective import Progress, append_row, learning_rate, resuming, save_checkpoint
-from umf_ros.lab.training.trainer import Team, Trainer, choose_device, join_team, load_run
+from umf_ros.lab.training.trainer import Team, Trainer, choose_device, join_team, load_run, read_recipe
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
 
@@ -414,3 +414,11 @@ def test_weights_of_another_network_do_not_start_a_run(tmp_path):
 def test_progress_is_plain_data():
     """It goes into the checkpoint, which holds nothing that could run."""
     assert Progress(**vars(Progress(step=3, losses={"total": 1.0}))).losses == {"total": 1.0}
+
+
+@pytest.mark.parametrize("seeds", ["first:last", "5:5", "-2:3"])
+def test_a_recipe_whose_seeds_name_no_world_is_refused(tmp_path, seeds):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(yaml.safe_dump({"training": seeds, "validation": "10000:10001", "stages": [{"steps": 1}]}))
+    with pytest.raises(ConfigError, match="seeds"):
+        read_recipe(str(recipe))

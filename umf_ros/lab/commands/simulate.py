@@ -151,7 +151,7 @@ def _write_shards(
     folder: Path, worlds: str, every: int, sequences: str, seed: int, workers: int, console: Console
 ) -> None:
     from umf_ros.lab.simulation.presets import SEQUENCES
-    from umf_ros.lab.simulation.survey import shard_plan, survey_world
+    from umf_ros.lab.simulation.survey import missing_worlds, seed_range, shard_plan, survey_world
 
     with _progress(console) as progress:
         if sequences:
@@ -162,23 +162,20 @@ def _write_shards(
                 if not path.exists():
                     _write_shard(path, survey, "hard", workers, progress)
             return
-        for world in _seed_range(worlds):
+        for path, world, _ in missing_worlds(folder, seed_range(worlds), every):
             family, setting = shard_plan(world)
-            path = folder / f"world_{world:05d}.npz"
-            if not path.exists():
-                _write_shard(path, survey_world(world, family, setting, every=every), setting, workers, progress)
+            _write_shard(path, survey_world(world, family, setting, every=every), setting, workers, progress)
 
 
 def _spread_shards(
     folder: Path, worlds: str, every: int, sequences: str, workers: int, ray: str, console: Console
 ) -> None:
     from umf_ros.core.tasks import spread
-    from umf_ros.lab.simulation.survey import write_world
+    from umf_ros.lab.simulation.survey import missing_worlds, seed_range, write_world
 
     if sequences:
         raise ConfigError("--ray spreads --worlds, not --sequences")
-    paths = {world: folder / f"world_{world:05d}.npz" for world in _seed_range(worlds)}
-    missing = [(path, world, every) for world, path in paths.items() if not path.exists()]
+    missing = missing_worlds(folder, seed_range(worlds), every)
     with _progress(console) as progress:
         task = progress.add_task("worlds", total=len(missing))
         spread(write_world, missing, workers, ray, lambda done: progress.update(task, completed=done))
@@ -205,14 +202,3 @@ def _progress(console: Console) -> Progress:
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     return Progress(*columns, console=console, transient=True)
-
-
-def _seed_range(text: str) -> range:
-    first, _, last = text.partition(":")
-    try:
-        seeds = range(int(first), int(last or int(first) + 1))
-    except ValueError:
-        raise ConfigError(f"seeds {text!r} are not of the form first:last+1") from None
-    if seeds.start < 0 or not seeds:
-        raise ConfigError(f"seeds {text!r} hold no world")
-    return seeds

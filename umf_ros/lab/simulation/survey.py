@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.errors import writing
+from umf_ros.core.errors import ConfigError, writing
 from umf_ros.core.frames import Image
 from umf_ros.core.geometry import Array, transform
 from umf_ros.core.io import atomic_write
@@ -152,6 +152,28 @@ def write_shard(
         samples.append(sample)
         progress(len(samples))
     save(path, _arrays(survey, samples, setting))
+
+
+def seed_range(text: str) -> range:
+    """The seeds of "first:last+1", or of one number.
+
+    Raises:
+        ConfigError: the text is of another form, or names no seed.
+    """
+    first, _, last = text.partition(":")
+    try:
+        seeds = range(int(first), int(last or int(first) + 1))
+    except ValueError:
+        raise ConfigError(f"seeds {text!r} are not of the form first:last+1") from None
+    if seeds.start < 0 or not seeds:
+        raise ConfigError(f"seeds {text!r} hold no world")
+    return seeds
+
+
+def missing_worlds(folder: Path, seeds: range, every: int) -> list[tuple[Path, int, int]]:
+    """Tasks of `write_world` for the shards that are not in a folder yet."""
+    paths = {seed: folder / f"world_{seed:05d}.npz" for seed in seeds}
+    return [(path, seed, every) for seed, path in paths.items() if not path.exists()]
 
 
 def write_world(task: tuple[Path, int, int]) -> None:

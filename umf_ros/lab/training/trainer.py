@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.distributed as dist
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError
 from torch import nn
 
 from umf_ros.baselines.place_network import count_parameters
@@ -29,7 +29,7 @@ from umf_ros.core.resources import find
 from umf_ros.core.tasks import spread
 from umf_ros.lab.datasets.listed import TrainingData, open_source
 from umf_ros.lab.datasets.sample import SampleSequence
-from umf_ros.lab.simulation.survey import write_world
+from umf_ros.lab.simulation.survey import missing_worlds, seed_range, write_world
 from umf_ros.lab.training.batches import made_ahead
 from umf_ros.lab.training.networks import RunSettings, read_card, write_settings
 from umf_ros.lab.training.objective import (
@@ -336,19 +336,6 @@ class Recipe(Group):
     common: dict[str, Any] = Field({}, description="settings of all stages")
     stages: list[dict[str, Any]] = Field(min_length=1, description="further settings of each stage")
 
-    @field_validator("training", "validation")
-    @classmethod
-    def _seeds(cls, value: str) -> str:
-        if not re.fullmatch(r"\d+:\d+", value) or not seeds(value):
-            raise ValueError("expected seeds as first:last+1")
-        return value
-
-
-def seeds(text: str) -> range:
-    """Return the seeds of "first:last+1"."""
-    first, last = text.split(":")
-    return range(int(first), int(last))
-
 
 def read_recipe(name: str) -> Recipe:
     """Return a recipe from `config/training` or from a YAML file.
@@ -359,9 +346,12 @@ def read_recipe(name: str) -> Recipe:
     """
     path = Path(name) if name.endswith(".yaml") else find(f"config/training/{name}.yaml")
     try:
-        return Recipe.model_validate(read_values(path))
+        recipe = Recipe.model_validate(read_values(path))
     except ValidationError as error:
         raise ConfigError(f"{path}: {problems(error)}") from None
+    for text in (recipe.training, recipe.validation):
+        seed_range(text)  # raises where it names none
+    return recipe
 
 
 def simulate_worlds(recipe: Recipe, folder: Path, workers: int | None, report: Callable[[int, int], None]) -> None:
@@ -376,9 +366,8 @@ def simulate_worlds(recipe: Recipe, folder: Path, workers: int | None, report: C
     Raises:
         OutputError: the folder cannot be written.
     """
-    wanted = [(folder / "validation" / f"world_{seed:05d}.npz", seed, 1) for seed in seeds(recipe.validation)]
-    wanted += [(folder / "train" / f"world_{seed:05d}.npz", seed, recipe.every) for seed in seeds(recipe.training)]
-    missing = [task for task in wanted if not task[0].exists()]
+    missing = missing_worlds(folder / "validation", seed_range(recipe.validation), 1)
+    missing += missing_worlds(folder / "train", seed_range(recipe.training), recipe.every)
     count = workers or len(os.sched_getaffinity(0))
     spread(write_world, missing, count, done=lambda done: report(done, len(missing)))
 
