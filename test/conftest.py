@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -124,6 +126,20 @@ def ros_context() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def mini_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fast drive around a small loop, one and a half times, in a world no one trained or tuned on."""
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:  # the workers share it: it takes a minute to simulate
+        shared = shared.parent
+    folder, part = shared / "mini", shared / "mini.part"
+    with (shared / "mini.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            part.mkdir()
+            _simulate_mini(part / "mini.mcap")
+            part.rename(folder)
+    return folder / "mini.mcap"
+
+
+def _simulate_mini(path: Path) -> None:
     from umf_ros.lab.simulation.bag_writer import BagWriter
     from umf_ros.lab.simulation.presets import DEMO, Preset, gentle_loop
     from umf_ros.lab.simulation.route import Walker
@@ -134,12 +150,10 @@ def mini_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     look = {"speed_m_s": 2.5, "swing_deg": 2.0, "sun_deg": 15.0, "drift": DEMO.drift}
     preset = Preset("a small loop", plan, length_m=46, samples=50, **look)
-    path = tmp_path_factory.mktemp("bags") / "mini.mcap"
     simulator = Simulator(preset, seed=20_777)
     with BagWriter(path) as bag:
         record(simulator, bag)
     write_side_files(simulator, path)
-    return path
 
 
 @pytest.fixture(scope="session")

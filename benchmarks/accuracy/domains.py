@@ -65,6 +65,8 @@ def main(
 ) -> None:
     """Verify true and false pairs of every domain and compare with the truth."""
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=120)  # the table, in a file
     extent = QUICK if quick else FULL
     chosen = [domain for domain in (STRANGE_DOMAINS if strange else DOMAINS) if only in domain.name]
     outcomes: dict[str, Outcome] = {}

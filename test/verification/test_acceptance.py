@@ -20,7 +20,7 @@ from umf_ros.verification.acceptance import (
     refuted,
     scores,
 )
-from umf_ros.verification.constants import MAX_MISFIT, MIN_LEAD, SUBMAP_UNEXPLAINED
+from umf_ros.verification.constants import MAX_MISFIT, MIN_LEAD, MIN_REPETITION, SUBMAP_UNEXPLAINED
 from umf_ros.verification.hypothesis import IMAGE, SCAN, kind_of
 from umf_ros.verification.measurement import MEASUREMENTS
 
@@ -208,6 +208,8 @@ def test_what_was_never_measured_is_not_what_a_closure_was_lost_by(shipped: Acce
         (GOOD | {"lead": 1.01}, None),
         (GOOD | {"lead": 0.99}, RejectReason.AMBIGUOUS),
         (without(GOOD, *RIVALS) | {"lead": 0.99}, RejectReason.PASSAGE),
+        (GOOD | {"repetition": 1.01 * MIN_REPETITION}, None),
+        (GOOD | {"repetition": 0.99 * MIN_REPETITION}, RejectReason.AMBIGUOUS),
         (GOOD | {"merged": 12.0, "unexplained": 0.99 * SUBMAP_UNEXPLAINED}, None),
         (GOOD | {"merged": 12.0, "unexplained": 1.01 * SUBMAP_UNEXPLAINED}, RejectReason.UNEXPLAINED),
         (GOOD | {"merged": 1.0, "unexplained": 1.01 * SUBMAP_UNEXPLAINED}, None),

@@ -43,7 +43,7 @@ def test_every_name_says_what_it_is() -> None:
     assert all(len(meaning.split()) >= 3 for meaning in MEASUREMENTS.values())
 
 
-NOT_HERE = {"upright_counterparts", "unexplained", "lead", "narrow", "runner_up"}
+NOT_HERE = {"upright_counterparts", "unexplained", "lead", "narrow", "repetition", "runner_up"}
 """Where nothing stands, in no passage, without odometry, of a single hypothesis."""
 
 

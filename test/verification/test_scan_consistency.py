@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from umf_ros.core.geometry import Array, invert, make_pose, transform
+from umf_ros.verification import constants as const
 from umf_ros.verification import thin_scan
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import inspect
-from umf_ros.verification.scan_consistency import ambiguity, compare_scans
+from umf_ros.verification.scan_consistency import ambiguity, compare_scans, repetition
 
 RNG = np.random.default_rng(5)
 UP = make_pose(np.eye(3), [0.0, 0.0, 1.5])  # the sensor on its mast
@@ -128,3 +129,24 @@ def test_a_room_that_looks_the_same_turned_round_has_a_rival_at_the_same_place()
         query, match = (seen(box((-6, 6), (-4, 4), 3.0, np.array(pillars)), np.eye(4), 9.0) for _ in range(2))
         found.append(ambiguity(match, query, np.eye(4), 100.0 * np.eye(6))["rival_far"])
     assert found[0] < 0.1 < found[1]
+
+
+def test_a_scan_of_pillars_that_come_again_fits_itself_elsewhere_as_well_as_another_scan() -> None:
+    """The next row, whose scan fits at the identity, lies out of sight: no rival of the pair shows it."""
+    x, y = np.meshgrid(np.arange(-18, 19, 3.0), np.arange(-18, 19, 3.0))
+    rows = np.column_stack([x.ravel() + 1.3, y.ravel() + 0.7])
+    single = RNG.uniform(-18, 18, (len(rows), 2))
+    found = []
+    for pillars, on_m in ((rows, 3.0), (single, 0.0)):
+        worlds = (box((-30, 30), (-30, 30), 3.0, pillars) for _ in range(2))
+        places = make_pose(np.eye(3), [on_m + 0.3, 0.2, 0.0]), np.eye(4)
+        query, match = (seen(world, place, 9.0) for world, place in zip(worlds, places, strict=True))
+        found.append(repetition(match, query, make_pose(np.eye(3), [0.3, 0.2, 0.0])))
+    assert found[0] < const.MIN_REPETITION < found[1] - 0.5
+
+
+def test_what_stands_decides_whether_a_place_repeats_and_not_its_bare_ground() -> None:
+    assert repetition(MATCH, QUERY, THERE) > 2 * const.MIN_REPETITION
+    world = hall()
+    flat = seen(world[world[:, 2] < 0.01], np.eye(4))
+    assert math.isnan(repetition(flat, flat, np.eye(4)))

@@ -120,6 +120,8 @@ def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
         return RejectReason.MISFIT, f"{misfit:.0f} times"
     if measurements.get("lead", math.nan) < 1.0:
         return RejectReason.PASSAGE if _in_passage(measurements) else RejectReason.AMBIGUOUS, ""
+    if measurements.get("repetition", math.nan) < const.MIN_REPETITION:
+        return RejectReason.AMBIGUOUS, "the scan fits itself elsewhere as well"
     unexplained = measurements.get("unexplained", math.nan)
     if measurements.get("merged", 1.0) > 1 and "narrow" not in measurements and unexplained > const.SUBMAP_UNEXPLAINED:
         return RejectReason.UNEXPLAINED, f"{unexplained:.0%}"

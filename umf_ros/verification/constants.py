@@ -94,6 +94,8 @@ RIVAL_MISFIT, MISFIT_FLOOR = 3.0, 0.05  # by hand: the worst misfit, in counterp
 # log of a ratio of misfits. measured: of right poses 2 in 100 have a rival as near as this, of wrong ones 86. Near
 # the identity: a wrong pose in a greenhouse had .15, and of 900 right poses with it all but 8 had more than this
 MIN_LEAD, PATTERN_LEAD = 0.1, 0.2
+# measured: of two wrong poses in greenhouses .003 and .11, of right ones in eight domains 3 in 100 have less
+MIN_REPETITION = 0.15
 SAME_PLACE_OF_SCANS_M = (
     0.3  # by hand: scans this near each other share the pattern; .2 and .4 refuse the same corridors
 )

@@ -49,6 +49,7 @@ MEASUREMENTS = {
     "rival_near": "logarithm of how much worse points, or the relief of open ground, fit half a metre on; unknown for "
     "improbable hypotheses",
     "rival_far": "the same of the best fit 1 to 6 m on; 0 when another pose fits as well",
+    "repetition": "logarithm of how much worse what stands around the query fits itself elsewhere than the match here",
     "lead": "how much worse points, or surfaces of scans in a passage, fit elsewhere; a closure needs 1",
     "runner_up": "logarithm of how much more is missing at the next best hypothesis about the pair",
     "pose_inliers": "feature pairs that agree with the pose",

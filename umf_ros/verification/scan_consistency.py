@@ -102,7 +102,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     poses = np.stack([pose, *beside, *along, *peaks])
     stands = structured(match, query)
     if stands:
-        misfits = (_point_misfit(match, query, poses) + _point_misfit(query, match, invert(poses))) / 2
+        misfits = _mean_point_misfit(match, query, poses)
     else:
         level = [levelled(match, query, one) for one in poses]
         misfits = np.array([relief_misfit(match.terrain, query.terrain, one) for one in level])
@@ -123,32 +123,68 @@ def _near_identity(pose: Array) -> bool:
     return float(np.linalg.norm(pose[:3, 3])) < const.PATTERN_M
 
 
-def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array:
-    """(K,) mean misfit with a scan of the other's visible points at poses (K, 4, 4); the worst where few are."""
-    points = at_poses(poses, other.scouts)
-    reach = np.tile(counterpart_reach(other.spacing[:: const.SCOUT_EVERY], common_blur(scan, other)), len(poses))
+def repetition(match: PreparedScan, query: PreparedScan, pose: Array) -> float:
+    """Return how much worse the query fits itself at the best other pose than it fits the match, as in `ambiguity`.
+
+    By the points of walls, trunks and rocks, for bare ground fits itself anywhere. Rows of plants or goods repeat: a
+    scan that fits itself a row on as well as the match fits it here may be of another row. NaN where little stands.
+
+    Args:
+        match: the matched scan.
+        query: the query's scan.
+        pose: (4, 4) `match_T_query`.
+    """
+    here = np.eye(4)
+    others = [one for one in alternatives(query, query, here) if not near(one, here, const.DISTINCT_M, np.pi / 2)]
+    if not others:
+        return np.nan
+    own = np.fmin.reduce(_mean_point_misfit(query, query, np.stack(others), standing=True))
+    fit = _mean_point_misfit(match, query, pose[None], standing=True)[0]
+    return float(np.log(np.maximum(own, const.MISFIT_FLOOR)) - np.log(np.maximum(fit, const.MISFIT_FLOOR)))
+
+
+def _mean_point_misfit(match: PreparedScan, query: PreparedScan, poses: Array, standing: bool = False) -> Array:
+    """(K,) mean of both ways of `_point_misfit` at poses (K, 4, 4) `match_T_query`."""
+    ways = _point_misfit(match, query, poses, standing), _point_misfit(query, match, invert(poses), standing)
+    mean: Array = np.mean(ways, axis=0)
+    return mean
+
+
+def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array, standing: bool = False) -> Array:
+    """(K,) mean misfit with a scan of the other's visible points at poses (K, 4, 4).
+
+    Of its scouts, and the worst misfit where few are visible; or of all that stand among its sample, and NaN.
+    """
+    stands = _upright(other, other.picks)
+    rows = np.flatnonzero(stands) if standing else np.arange(0, len(stands), const.SCOUT_EVERY)
+    points = at_poses(poses, other.sample[rows])
+    reach = np.tile(counterpart_reach(other.spacing[rows], common_blur(scan, other)), len(poses))
     away = np.sqrt(
-        scan.nearest(points)[1] if patterned(scan, other) else _nearest_of_others(scan, other, poses, points)
+        scan.nearest(points)[1] if patterned(scan, other) else _nearest_of_others(scan, other, poses, points, rows)
     )
     misfit = np.minimum(away / reach, const.RIVAL_MISFIT)
     seen = (visible(scan.look_at(points)) & np.isfinite(away)).reshape(len(poses), -1)
-    return mean_misfits(misfit.reshape(seen.shape), seen, const.FEWEST_POINTS, const.RIVAL_MISFIT)
+    otherwise = np.nan if standing else const.RIVAL_MISFIT
+    return mean_misfits(misfit.reshape(seen.shape), seen, const.FEWEST_POINTS, otherwise)
 
 
-def _nearest_of_others(submap: PreparedScan, other: PreparedScan, poses: Array, points: Array) -> Array:
+def _nearest_of_others(
+    submap: PreparedScan, other: PreparedScan, poses: Array, points: Array, rows: NDArray[np.intp]
+) -> Array:
     """(K * N,) m^2: squared distance of each point to the nearest one that was seen from another place, or infinite.
 
     Args:
         submap: has the nearest points.
-        other: has the points, its scouts.
+        other: has the points.
         poses: (K, 4, 4) `submap_T_other`.
-        points: (K * N, 3) m, the scouts at the poses.
+        points: (K * N, 3) m, some of its sample at the poses.
+        rows: (N,) of the sample.
     """
     places = at_poses(poses, other.lidars).reshape(len(poses), -1, 1, 3)
     apart = np.linalg.norm(places - submap.lidars, axis=3) > const.SAME_PLACE_OF_SCANS_M
     index, squared = submap.tree.batch_knn_search(points, const.NEIGHBOURS, 1)
     theirs = submap.owner[np.asarray(index, np.intp)].reshape(len(poses), -1, const.NEIGHBOURS)
-    ours = other.owner[other.picks[:: const.SCOUT_EVERY]]
+    ours = other.owner[other.picks[rows]]
     known = apart[np.arange(len(poses))[:, None, None], ours[None, :, None], theirs]
     return np.where(known.reshape(len(points), -1), np.asarray(squared), np.inf).min(axis=1)
 

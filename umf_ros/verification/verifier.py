@@ -14,7 +14,7 @@ from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
-from umf_ros.verification.hypothesis import Hypothesis, RejectReason, measurements_of, same_pose
+from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
 from umf_ros.verification.pose_search import (
     RotatedMaps,
@@ -25,7 +25,7 @@ from umf_ros.verification.pose_search import (
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans, inspect
-from umf_ros.verification.scan_consistency import ambiguity, locate_along
+from umf_ros.verification.scan_consistency import ambiguity, locate_along, repetition
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 
@@ -176,6 +176,7 @@ class Verifier:
         found = locate_along(theirs, ours, hypothesis.pose)
         if found is None:
             hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
+            hypothesis.measurements |= known_only({"repetition": repetition(theirs, ours, hypothesis.pose)})
             return
         hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
         self._measure(hypothesis)

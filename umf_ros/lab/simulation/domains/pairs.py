@@ -22,7 +22,7 @@ from umf_ros.lab.simulation.domains.passages import Passage
 from umf_ros.lab.simulation.domains.passages import drive as drive_passage
 from umf_ros.lab.simulation.domains.survey import FIRST, MOUNTS, OTHER_WAY, SAME_WAY
 from umf_ros.sensors.decode import Cloud
-from umf_ros.submaps.history import DriftMeter, needed_scans, submap_of
+from umf_ros.submaps.history import DriftMeter, can_be_merged, needed_scans, submap_of
 from umf_ros.verification import Verifier
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import thin_scan
@@ -165,15 +165,15 @@ def _keyframe_along(scan: DomainScan, domain: Domain) -> Keyframe:
 
 def _submaps(drive: list[Keyframe], wanted: range) -> dict[int, tuple[Keyframe | None, Keyframe | None]]:
     """Submaps of what was seen before and around some keyframes of a visit."""
-    anchors, drift = [drive[0]], DriftMeter()
-    for keyframe in drive:
-        if keyframe.path_length_m - anchors[-1].path_length_m >= const.MERGE_STEP_M:
+    anchors, drift = list[Keyframe](), DriftMeter()
+    for keyframe in filter(can_be_merged, drive):
+        if not anchors or keyframe.path_length_m - anchors[-1].path_length_m >= const.MERGE_STEP_M:
             before = _between(anchors, keyframe, -const.ODOMETRY_REACH_M, 0.0)
             if needed_scans(keyframe, before):
                 drift.add(keyframe, before)
             anchors.append(keyframe)
-    found = {}
-    for number in wanted:
+    found: dict[int, tuple[Keyframe | None, Keyframe | None]] = dict.fromkeys(wanted, (None, None))
+    for number in (one for one in wanted if can_be_merged(drive[one])):
         reaches = (0.0, const.ODOMETRY_REACH_M)
         others = [_between(anchors, drive[number], -const.ODOMETRY_REACH_M, last_m) for last_m in reaches]
         submaps = [submap_of(drive[number], one, drift) for one in others]
