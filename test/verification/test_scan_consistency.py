@@ -149,4 +149,6 @@ def test_what_stands_decides_whether_a_place_repeats_and_not_its_bare_ground() -
     assert repetition(MATCH, QUERY, THERE) > 2 * const.MIN_REPETITION
     world = hall()
     flat = seen(world[world[:, 2] < 0.01], np.eye(4))
-    assert math.isnan(repetition(flat, flat, np.eye(4)))
+    poses = np.stack([UP, make_pose(np.eye(3), [1.5, 0.0, 1.5])])
+    submap = PreparedScan(flat.points.astype(np.float32), poses, owner=np.arange(len(flat.points)) % 2)
+    assert math.isnan(repetition(flat, flat, np.eye(4))) and math.isnan(repetition(submap, submap, np.eye(4)))

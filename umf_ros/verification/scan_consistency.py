@@ -186,7 +186,7 @@ def _nearest_of_others(
     theirs = submap.owner[np.asarray(index, np.intp)].reshape(len(poses), -1, const.NEIGHBOURS)
     ours = other.owner[other.picks[rows]]
     known = apart[np.arange(len(poses))[:, None, None], ours[None, :, None], theirs]
-    return np.where(known.reshape(len(points), -1), np.asarray(squared), np.inf).min(axis=1)
+    return np.where(known.reshape(-1, const.NEIGHBOURS), np.asarray(squared), np.inf).min(axis=1)
 
 
 def mean_misfits(misfits: Array, known: Mask, fewest: float, otherwise: float) -> Array:
