@@ -302,9 +302,8 @@ class LoopDetector:
         """
         if not self.select(frame):
             return False
-        known = self.database.newest_at(frame.stamp_ns)
-        if known is not None:
-            self._submaps.remember(self._continue_from(known))
+        if known := self.database.store.rows_at(frame.stamp_ns):
+            self._submaps.remember(self._continue_from(known[-1]))
         return True
 
     def next_inter_robot_closure(self) -> InterRobotClosure | None:

@@ -134,7 +134,7 @@ def test_a_duplicate_is_found_and_another_keyframe_of_its_stamp_is_not() -> None
     assert places.find_duplicate(make_keyframe(1, seed=2, session=9)) == row
     assert places.find_duplicate(make_keyframe(1, seed=5)) is None
     assert places.find_duplicate(make_keyframe(2, seed=2)) is None
-    assert places.newest_at(10**9) == row and places.newest_at(7) is None
+    assert places.store.rows_at(10**9)[-1] == row and not places.store.rows_at(7)
 
 
 def test_saving_copies_everything(tmp_path: Path) -> None:

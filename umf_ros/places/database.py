@@ -124,14 +124,9 @@ class PlaceDatabase:
     def __getitem__(self, index: int) -> Keyframe:
         return self.store[index]
 
-    def newest_at(self, stamp_ns: int) -> int | None:
-        """Return the index of the newest keyframe of a stamp; None when there is none."""
-        return next(reversed(self.store.rows_at(stamp_ns)), None)
-
     def find_duplicate(self, keyframe: Keyframe) -> int | None:
         """Return the index of the same measurement, stored in an earlier replay of the recording; None without one."""
-        rows = self.store.rows_at(keyframe.stamp_ns)
-        if not rows:
+        if not (rows := self.store.rows_at(keyframe.stamp_ns)):
             return None
         similarity = self.store.descriptors(np.array(rows)) @ keyframe.embedding.descriptor
         best = int(similarity.argmax())
@@ -163,10 +158,13 @@ class PlaceDatabase:
             rules: the places that may be candidates.
             sessions: search the places of these sessions, of any age.
         """
-        admissible = partial(self.admissible, keyframe, rules, sessions)
+        admissible, descriptor = partial(self.admissible, keyframe, rules, sessions), keyframe.embedding.descriptor
         for wanted in (2 * rules.top_k, WIDER * rules.top_k):
-            found = self._most_similar(keyframe.embedding.descriptor, wanted, admissible)
-            similar = [(row, similarity) for row, similarity in found if similarity >= rules.min_similarity]
+            rows = np.sort(self.index.search(descriptor, wanted + MARGIN, admissible))
+            similarity = self.store.descriptors(rows) @ descriptor
+            order = np.argsort(-similarity, kind="stable")[:wanted]  # equal ones in order of row
+            order = order[similarity[order] >= rules.min_similarity]
+            similar = [(int(rows[i]), float(similarity[i])) for i in order]
             chosen = self._diverse(similar, rules.top_k)
             if len(chosen) == rules.top_k or len(similar) < wanted:
                 break
@@ -190,7 +188,7 @@ class PlaceDatabase:
     def _open_index(self, dimension: int) -> PlaceIndex:
         """Return the index of the file, if it matches the store, completed from the store."""
         path, size = self._index_path, len(self.store)
-        index = PlaceIndex.load(path, dimension) if path is not None else None
+        index = PlaceIndex.load(path, dimension) if path is not None and path.is_file() else None
         if index is None or not self._matches(index):
             if path is not None and not self.store.read_only:
                 path.unlink(missing_ok=True)
@@ -215,13 +213,6 @@ class PlaceDatabase:
             self.index.save(self._index_path)
         except OutputError as error:
             logger.warning("%s; the index is rebuilt at the next start", error)
-
-    def _most_similar(self, descriptor: Array, wanted: int, admissible: Admissible) -> list[tuple[int, float]]:
-        """Return rows and cosine similarities of the most similar places, best first; equal ones in order of row."""
-        rows = np.sort(self.index.search(descriptor, wanted + MARGIN, admissible))
-        similarity = self.store.descriptors(rows) @ descriptor
-        order = np.argsort(-similarity, kind="stable")[:wanted]
-        return [(int(rows[i]), float(similarity[i])) for i in order]
 
     def _diverse(self, found: list[tuple[int, float]], count: int) -> list[tuple[int, float]]:
         """Return the best `count`, with keyframes of one place from `VISITS` sessions at most.
@@ -295,22 +286,18 @@ class PlaceIndex:
         """Return (N, D) descriptors of some rows, in half precision."""
         return np.asarray(self._flat.reconstruct_batch(rows))
 
-    def search(self, descriptor: Points, count: int, admissible: Admissible) -> Rows:
+    def search(self, descriptor: Points, count: int, admissible: Admissible, exact: bool = False) -> Rows:
         """Return the rows of the `count` descriptors that are most similar to a unit vector (D,), best first.
 
-        A large index is searched through its shortlist, and exhaustively where too few of the list are admissible.
+        A large index is searched through its shortlist; exhaustively where too few of it are admissible, or if `exact`.
         """
-        if not self.is_exact:
+        if not (exact or self.is_exact):
             with _one_thread():
                 _, found = self._index.search(descriptor[None], min(SHORTLIST, len(self)))
             rows: Rows = found[0][found[0] >= 0]
             rows = rows[admissible(rows)]
             if len(rows) >= count:
                 return rows[:count]
-        return self.search_exactly(descriptor, count, admissible)
-
-    def search_exactly(self, descriptor: Points, count: int, admissible: Admissible) -> Rows:
-        """Return the same by an exhaustive search."""
         if not len(self):
             return np.empty(0, np.intp)
         with _one_thread() as faiss:
@@ -326,9 +313,7 @@ class PlaceIndex:
 
     @classmethod
     def load(cls, path: Path, dimension: int) -> PlaceIndex | None:
-        """Return the index in a file; None where there is none of this kind and dimension."""
-        if not path.is_file():
-            return None
+        """Return the index in a file; None where it has none of this kind and dimension."""
         index = cls(dimension)
         with _one_thread() as faiss:
             try:

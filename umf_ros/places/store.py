@@ -139,8 +139,7 @@ class KeyframeStore:
             key = row, keyframe.stamp_ns, keyframe.session, keyframe.path_length_m
             descriptor = np.ascontiguousarray(keyframe.embedding.descriptor, np.float32).tobytes()
             with self._file.writing() as connection:
-                values = (*key, descriptor, pack(keyframe))
-                connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?, ?)", values)
+                connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?, ?)", (*key, descriptor, pack(keyframe)))
                 if self._outgoing:
                     connection.execute("INSERT OR IGNORE INTO outbox VALUES (?)", (row,))
             if self._count == len(self._keys):

@@ -162,7 +162,7 @@ def _share(index: PlaceIndex, descriptor: Points) -> float:
     def everywhere(rows: Rows | slice) -> np.ndarray:
         return np.ones(len(index), bool)[rows]
 
-    true = set(index.search_exactly(descriptor, TOP, everywhere).tolist())
+    true = set(index.search(descriptor, TOP, everywhere, exact=True).tolist())
     return len(true & set(index.search(descriptor, TOP, everywhere).tolist())) / len(true)
 
 
