@@ -51,10 +51,11 @@ def test_next_to_nothing_is_ready_at_once(points: np.ndarray) -> None:
 
 def test_the_cache_is_bounded() -> None:
     scans = ScanCache()
-    keyframes = [replace(take(GROUND, HERE, 1.0), stamp_ns=i, points=np.ones((5, 3), np.float32)) for i in range(99)]
+    keyframe = replace(take(GROUND, HERE, 1.0), points=np.ones((5, 3), np.float32))
+    keyframes = [replace(keyframe, stamp_ns=i) for i in range(SCANS_KEPT + 1)]
     first = scans[keyframes[0]]
     assert scans[keyframes[0]] is first
-    for keyframe in keyframes[1 : SCANS_KEPT + 1]:
+    for keyframe in keyframes[1:]:
         assert scans[keyframe] is not first
     assert scans[keyframes[0]] is not first  # gave way to newer ones
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Candidate, Embedding, Keyframe, LocalFeatures, StereoCamera
@@ -35,10 +36,12 @@ class BumpyGround:
 
     def height(self, places: Array) -> Array:
         """Height of the ground under places (N, 2)."""
-        if not len(self.bumps):
-            return np.zeros(len(places))
-        away = ((places[:, None] - self.bumps[None, :, :2]) ** 2).sum(axis=2)
-        return (self.bumps[:, 3] * np.exp(-away / (2 * self.bumps[:, 2] ** 2))).sum(axis=1)
+        found, tree = np.zeros(len(places)), cKDTree(places)
+        for bump in self.bumps:
+            under = tree.query_ball_point(bump[:2], 6 * bump[2])  # beyond six radii a bump is as good as flat
+            away = ((places[under] - bump[:2]) ** 2).sum(axis=1)
+            found[under] += bump[3] * np.exp(-away / (2 * bump[2] ** 2))
+        return found
 
 
 def landscape(seed: int, bumps: int = 500, landmarks: int = 800, height_m: float = 0.35) -> BumpyGround:
