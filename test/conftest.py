@@ -37,12 +37,22 @@ MARKED = {
     ),
 }
 """Markers by folders and files of tests; `make check` leaves all of them out."""
+LONG = (
+    *("submaps/test_finder.py", "commands/test_replay.py", "test_detector.py", "nodes", "commands/test_map", "maps"),
+    *("lab/evaluation", "lab/simulation", "lab/training", "fleet", "benchmarks", "bags"),
+)
+"""Folders and files of tests that take longest: they begin first, so that no worker ends long after the others."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     root = Path(__file__).parent
+    begins = {one: order for order, one in enumerate(LONG)}
+    names = {item.path: item.path.relative_to(root).as_posix() for item in items}
+    items.sort(
+        key=lambda item: min((begins[one] for one in LONG if names[item.path].startswith(one)), default=len(LONG))
+    )
     for item in items:
-        name = item.path.relative_to(root).as_posix()
+        name = names[item.path]
         for marker, places in MARKED.items():
             if name.startswith(tuple(place if place.endswith(".py") else f"{place}/" for place in places)):
                 item.add_marker(marker)
