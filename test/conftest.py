@@ -143,7 +143,7 @@ def mini_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with (shared / "mini.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not folder.exists():
-            part.mkdir()
+            part.mkdir(exist_ok=True)
             _simulate_mini(part / "mini.mcap")
             part.rename(folder)
     return folder / "mini.mcap"

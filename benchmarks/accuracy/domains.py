@@ -64,9 +64,7 @@ def main(
     strange: Annotated[bool, typer.Option(help="the domains that no decision is fitted to")] = False,
 ) -> None:
     """Verify true and false pairs of every domain and compare with the truth."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=120)  # the table, in a file
+    console = Console(width=None if sys.stdout.isatty() else 120)
     extent = QUICK if quick else FULL
     chosen = [domain for domain in (STRANGE_DOMAINS if strange else DOMAINS) if only in domain.name]
     outcomes: dict[str, Outcome] = {}
