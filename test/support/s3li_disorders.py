@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from umf_ros.core.errors import UmfError
 from umf_ros.lab.datasets.s3li_folder import find_s3li
@@ -36,9 +37,9 @@ def run(folder: Path, seed: int, taken_out: str) -> dict[str, Any]:
     """Figures of one sequence without one disorder."""
     name = VULCANO if taken_out == "baseline" else ETNA
     disorders = Disorders() if taken_out == AS_IT_IS else replace(Disorders(), **{taken_out: False})
-    twin.SHORTEST_M, twin.SHORTEST_LOOP_M = LENGTHS_M
-    for _ in twin.write_twin(folder, seed, 0.01, (name,), disorders):
-        pass
+    with patch.multiple(twin, SHORTEST_M=LENGTHS_M[0], SHORTEST_LOOP_M=LENGTHS_M[1]):
+        for _ in twin.write_twin(folder, seed, 0.01, (name,), disorders):
+            pass
     sequence = find_s3li(folder).sequences[0]
     try:
         return dict(in_own_process(replay_sequence, sequence, folder / "run", report=lambda done: None))
