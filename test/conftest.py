@@ -46,11 +46,9 @@ LONG = (
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     root = Path(__file__).parent
-    begins = {one: order for order, one in enumerate(LONG)}
     names = {item.path: item.path.relative_to(root).as_posix() for item in items}
-    items.sort(
-        key=lambda item: min((begins[one] for one in LONG if names[item.path].startswith(one)), default=len(LONG))
-    )
+    # stable: the order within a folder stays
+    items.sort(key=lambda item: next((i for i, one in enumerate(LONG) if names[item.path].startswith(one)), len(LONG)))
     for item in items:
         name = names[item.path]
         for marker, places in MARKED.items():

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, Points
-from umf_ros.core.geometry import Array, heading, invert, make_pose, relative, transform
+from umf_ros.core.geometry import Array, heading, invert, make_pose, near, relative, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import GridMap, Spectra, terrain_fit
 from umf_ros.verification.hypothesis import Hypothesis, same_pose
@@ -92,9 +92,9 @@ def coarse_align(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
     """Refine a pose by a few points, and count how many of them find a counterpart."""
     pose = _by_scouts(match, query, guess)
     squared = match.nearest(transform(pose, query.scouts))[1]
-    near = squared < (const.SCOUT_NEAR * query.cell_m) ** 2
+    close = squared < (const.SCOUT_NEAR * query.cell_m) ** 2
     terrain = terrain_fit(match.terrain, query.terrain, levelled(match, query, pose))[1]
-    return Fit(pose, float(near.mean()), terrain, structured(match, query))
+    return Fit(pose, float(close.mean()), terrain, structured(match, query))
 
 
 def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
@@ -112,7 +112,7 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     for number in np.flatnonzero(match.view.overlap(query.view, turns) >= const.SEARCHED_OVERLAP):
         peaks = _peaks(correlation[:, [number]], np.zeros(1, np.intp), const.PEAKS // 2, query.cell_m)
         found += [_by_scouts(match, query, lifted(match, query, turns[number], shift)) for _, shift in peaks]
-    return found
+    return [one for one in found if not near(one, pose, const.DISTINCT_M, np.pi / 2)]
 
 
 def _by_scouts(match: PreparedScan, query: PreparedScan, guess: Array) -> Array:

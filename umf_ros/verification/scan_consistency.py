@@ -98,8 +98,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     across = np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1]
     way = np.append(across, 0.0)
     beside, along = (shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
-    peaks = [one for one in alternatives(match, query, pose) if not near(one, pose, const.DISTINCT_M, np.pi / 2)]
-    poses = np.stack([pose, *beside, *along, *peaks])
+    poses = np.stack([pose, *beside, *along, *alternatives(match, query, pose)])
     stands = structured(match, query)
     if stands:
         misfits = _mean_point_misfit(match, query, poses)
@@ -134,8 +133,7 @@ def repetition(match: PreparedScan, query: PreparedScan, pose: Array) -> float:
         query: the query's scan.
         pose: (4, 4) `match_T_query`.
     """
-    here = np.eye(4)
-    others = [one for one in alternatives(query, query, here) if not near(one, here, const.DISTINCT_M, np.pi / 2)]
+    others = alternatives(query, query, np.eye(4))
     if not others:
         return np.nan
     own = np.fmin.reduce(_mean_point_misfit(query, query, np.stack(others), standing=True))
@@ -155,8 +153,8 @@ def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array, standin
 
     Of its scouts, and the worst misfit where few are visible; or of all that stand among its sample, and NaN.
     """
-    stands = _upright(other, other.picks)
-    rows = np.flatnonzero(stands) if standing else np.arange(0, len(stands), const.SCOUT_EVERY)
+    picks = other.picks
+    rows = np.flatnonzero(_upright(other, picks)) if standing else np.arange(0, len(picks), const.SCOUT_EVERY)
     points = at_poses(poses, other.sample[rows])
     reach = np.tile(counterpart_reach(other.spacing[rows], common_blur(scan, other)), len(poses))
     away = np.sqrt(
