@@ -28,7 +28,7 @@ def write_pos(path: Path, seconds: float, x_is_east_deg: float = 30.0) -> Path:
         clock = 18 * 3600 + (stamp - START_NS) / 1e9
         time = f"{int(clock // 3600):02d}:{int(clock % 3600 // 60):02d}:{clock % 60:06.3f}"
         lines.append(f"2021/07/07 {time} {latitude:.10f} {longitude:.10f} {HEIGHT:.4f} 1 12")
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
 

@@ -35,7 +35,7 @@ class Process:
         flags = [("-r" if parameter.startswith("__") else "-p", parameter) for parameter in parameters]
         arguments = ["--ros-args", *(word for flag in flags for word in flag)]
         self._log = log
-        self._file = log.open("w")
+        self._file = log.open("w", encoding="utf-8")
         self._process = subprocess.Popen(
             [*(command or [sys.executable, "-m", module]), *(arguments if parameters else [])],
             stdout=self._file,
@@ -55,7 +55,9 @@ class Process:
     @property
     def child(self) -> int:
         """Process that this one started."""
-        (number,) = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text().split()
+        (number,) = (
+            Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text(encoding="utf-8").split()
+        )
         return int(number)
 
     def wait_for(self, text: str, timeout_s: float = 90.0) -> None:
@@ -85,14 +87,19 @@ class Process:
 
 
 def call_service(node: Any, kind: type, service: str, request: object) -> Any:
-    """Call a service of another process and return its response."""
+    """Call a service of another process and return its response.
+
+    DDS drops the reply of a server that has not discovered the client yet, so an unanswered request is sent again.
+    """
     import rclpy
 
     client = node.create_client(kind, service)
-    assert client.wait_for_service(20.0)
-    future = client.call_async(request)
-    assert wait_until(future.done, 40.0, spin=lambda: rclpy.spin_once(node, timeout_sec=0.05))
-    return future.result()
+    assert client.wait_for_service(60.0), service
+    for _ in range(6):
+        future = client.call_async(request)
+        if wait_until(future.done, 15.0, spin=lambda: rclpy.spin_once(node, timeout_sec=0.05)):
+            return future.result()
+    raise AssertionError(f"{service} never answers")
 
 
 def wait_until(

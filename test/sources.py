@@ -17,7 +17,7 @@ PACKAGE = ROOT / "umf_ros"
 def imports(path: Path) -> list[str]:
     """Every module that a file imports, in functions too."""
     names = []
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -81,7 +81,7 @@ def test_the_nearest_of_two_installations_is_used(tmp_path: Path) -> None:
         (prefix / "share" / "umf_ros" / "models").mkdir(parents=True)
         (prefix / "share" / "umf_ros" / "models" / "a.safetensors").write_text(prefix.name)
     found = found_by(inner / "lib" / "python3.12" / "site-packages", "models/a.safetensors")
-    assert Path(found).read_text() == "install"
+    assert Path(found).read_text(encoding="utf-8") == "install"
 
 
 def test_an_installation_without_its_files_says_so(tmp_path: Path) -> None:

@@ -102,12 +102,12 @@ PEERS = {"map_closures": map_closures, "kiss_slam": kiss_slam, "kiss_matcher": k
 def main() -> None:
     """Run one peer."""
     peer, scans_file, settings_file, out = sys.argv[1:]
-    scans, settings = Scans(Path(scans_file)), json.loads(Path(settings_file).read_text())
+    scans, settings = Scans(Path(scans_file)), json.loads(Path(settings_file).read_text(encoding="utf-8"))
     before = time.process_time()
     answer = PEERS[peer](scans, settings)
     answer["cpu_s"] = time.process_time() - before
     answer["memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    Path(out).write_text(json.dumps(answer))
+    Path(out).write_text(json.dumps(answer), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -149,7 +149,7 @@ def fuzz(part: str, task: Task, count: int, rng: np.random.Generator) -> Figures
 
 def resident() -> int:
     """Bytes of memory of this process."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def many_places(rng: np.random.Generator, count: int = 100_000) -> Figures:

@@ -181,7 +181,7 @@ def _later(world: GraphWorld, row: int) -> Any:
 
 def _memory_mb(process: int) -> float:
     """Resident memory of a process."""
-    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    pages = int(Path(f"/proc/{process}/statm").read_text(encoding="utf-8").split()[1])
     return round(pages * 4096 / 1e6)
 
 

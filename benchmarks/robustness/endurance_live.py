@@ -350,6 +350,6 @@ def _spin(executor: SingleThreadedExecutor) -> None:
 
 def _median_ms(path: Path) -> float:
     """Median of the milliseconds of a keyframe, of those that had candidates."""
-    with path.open(newline="") as file:
+    with path.open(encoding="utf-8", newline="") as file:
         times = [float(row["total"]) for row in csv.DictReader(file) if float(row["verify"]) > 1.0]
     return round(float(np.median(times)), 1) if times else float("nan")

@@ -54,7 +54,7 @@ UMF = [sys.executable, "-m", "umf_ros.cli"]
 
 def start(command: list[str], interrupt: bool) -> str:
     """How one start ends: "fine", "hangs" or "failures"."""
-    with tempfile.TemporaryFile("w+") as log:
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
         deadline = time.monotonic() + LIMIT_S
         try:

@@ -176,13 +176,13 @@ def test_raw_bayer_images_of_vulcano_arrive_rectified(tmp_path: Path) -> None:
 def test_guesses_of_the_calibration_are_one_warning(tmp_path: Path) -> None:
     settings = small_settings(tmp_path)
     calibration = Path(settings.calibration)
-    text = calibration.read_text()
+    text = calibration.read_text(encoding="utf-8")
     bag, told = open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), list[str]()
     FrameReader(bag, settings, warn=told.append)
     assert not any("guess" in line for line in told)
     lines = text.split("\n")
     guessed = [f"{line}  # TO BE MEASURED: a guess" if line.startswith("body_T_l") else line for line in lines]
-    calibration.write_text("# TO BE MEASURED: the baseline\n" + "\n".join(guessed))
+    calibration.write_text("# TO BE MEASURED: the baseline\n" + "\n".join(guessed), encoding="utf-8")
     FrameReader(bag, settings, warn=told.append)
     assert [line for line in told if "guess" in line] == [
         "the calibration holds guesses, measure them: the baseline, body_T_lidar"

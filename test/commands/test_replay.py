@@ -77,7 +77,7 @@ def truth_of(bag: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
+    with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
@@ -123,7 +123,9 @@ def test_without_odometry_closures_are_found_and_the_graph_is_skipped(
 ) -> None:
     config = tmp_path / "no_odometry.yaml"
     config.write_text(
-        mini_config.read_text().replace("loop:", "topics.odometry: '', keyframe.untracked_period_s: 0.4, loop:")
+        mini_config.read_text(encoding="utf-8").replace(
+            "loop:", "topics.odometry: '', keyframe.untracked_period_s: 0.4, loop:"
+        )
     )
     done = umf("replay", mini_bag, "--config", config, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr

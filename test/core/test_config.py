@@ -11,7 +11,7 @@ from umf_ros.core.errors import ConfigError
 
 
 def write(path: Path, text: str) -> Path:
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     return path
 
 

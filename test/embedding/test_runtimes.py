@@ -220,3 +220,32 @@ def test_a_network_that_cannot_run_is_refused_at_the_start(monkeypatch):
     monkeypatch.setattr(runtimes, "XFEAT_SHAPE", (1, 3, 384, 512))  # three channels
     with pytest.raises(WeightsError, match=r"xfeat.safetensors cannot be run: ."):
         xfeat(XFEAT, "openvino")
+
+
+LOADING = """
+import locale, threading
+from umf_ros.core.config import EmbeddingSettings
+from umf_ros.embedding.runtimes import OUTPUTS, XFEAT_OUTPUTS, make_runtime
+from umf_ros.core.resources import find
+
+before = locale.setlocale(locale.LC_ALL)
+asked = [("umf_scene", OUTPUTS), ("xfeat", XFEAT_OUTPUTS)] * 3
+failed, begin = [], threading.Barrier(len(asked))
+threading.excepthook = lambda arguments: failed.append(str(arguments.exc_value))
+
+def load(name, outputs):
+    weights = find(f"models/{name}.safetensors")
+    begin.wait()
+    make_runtime(weights, EmbeddingSettings(runtime="openvino", threads=1), outputs)
+
+threads = [threading.Thread(target=load, args=one) for one in asked]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+print(failed, locale.setlocale(locale.LC_ALL) == before)
+"""
+
+
+def test_threads_that_load_at_once_neither_fail_nor_change_the_locale():
+    """Else a model is "damaged", or all text of the process is ASCII from then on."""
+    done = subprocess.run([sys.executable, "-c", LOADING], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "[] True\n"), done.stdout + done.stderr

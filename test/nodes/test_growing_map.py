@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from processes import Process, wait_until
+from processes import Process, call_service, wait_until
 from std_srvs.srv import Trigger
 from vlp16_rover import CALIBRATION, Vlp16Rover
 
@@ -36,11 +36,8 @@ def test_what_is_seen_while_localising_becomes_a_session_at_save_and_at_the_end(
         second = Process(MODULE, tmp_path / "second.log", *common, *localising, f"results_dir:={after}")
         rig.until_heard(second)
         rig.drive(5.0, 1_700_001_000, pause_s=0.2)  # no keyframe is dropped
-        client = rig.create_client(Trigger, "/loop_closure_node/save")
-        assert client.wait_for_service(20.0)
-        future = client.call_async(Trigger.Request())
-        assert wait_until(future.done, 60.0, rig.spin)
-        assert future.result().success and "sessions" in future.result().message, future.result().message
+        answer = call_service(rig, Trigger, "/loop_closure_node/save", Trigger.Request())
+        assert answer.success and "sessions" in answer.message, answer.message
         saved = MapFolder.open(target.path).sessions
         assert len(saved) == 2 and saved[1].places >= 4
         rig.drive(5.0, start_s=1_700_001_006)

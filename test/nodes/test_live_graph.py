@@ -82,7 +82,7 @@ def offline(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPath
 
 
 def rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
+    with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 

@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from maps_made import COVARIANCE, MadeSession, made_map, on_circle
 from nav_msgs.msg import Odometry
-from processes import Process, wait_until
+from processes import Process, call_service, wait_until
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from std_srvs.srv import Trigger
@@ -105,10 +105,7 @@ def test_pose_and_transform_come_once_the_rover_is_found(rover: Rover, map_folde
     assert 0 < covariance[0, 0] < 0.1
     assert rover.until(lambda: float(rover.status.get("probability", 0)) > 0.99)
     assert rover.status["message"].startswith("in the map")
-    client = rover.create_client(Trigger, "/pose_graph_node/reset")
-    assert client.wait_for_service(20.0)
-    future = client.call_async(Trigger.Request())
-    assert rover.until(future.done)
+    call_service(rover, Trigger, "/pose_graph_node/reset", Trigger.Request())
     assert rover.until(lambda: rover.status["message"].startswith("not localised"))
     assert process.interrupt() == 0
     assert (tmp_path / "out" / "trajectory_in_map.tum").is_file()

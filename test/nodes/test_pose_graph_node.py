@@ -15,8 +15,8 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from diagnostic_msgs.srv import AddDiagnostics
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from processes import Process, call_service, wait_until
@@ -293,14 +293,12 @@ def test_a_namespace_is_a_robot(rig: Rig, process: Process, tmp_path: Path) -> N
 
 def test_without_autostart_it_waits_for_its_life_cycle(rig: Rig, tmp_path: Path) -> None:
     process = Process(MODULE, tmp_path / "node.log", "autostart:=false")
-    change = rig.create_client(ChangeState, "/pose_graph_node/change_state")
-    assert change.wait_for_service(60.0)
-    assert rig.count_subscribers("/loop_closures") == 0
+    state = call_service(rig, GetState, "/pose_graph_node/get_state", GetState.Request()).current_state.id
+    assert state == State.PRIMARY_STATE_UNCONFIGURED and rig.count_subscribers("/loop_closures") == 0
 
     def step(number: int) -> None:
-        future = change.call_async(ChangeState.Request(transition=Transition(id=number)))
-        rig.until(future.done)
-        assert future.result().success, process.output
+        request = ChangeState.Request(transition=Transition(id=number))
+        assert call_service(rig, ChangeState, "/pose_graph_node/change_state", request).success, process.output
 
     step(Transition.TRANSITION_CONFIGURE)
     step(Transition.TRANSITION_ACTIVATE)
@@ -321,14 +319,12 @@ def test_without_a_clock_it_says_so(rig: Rig, tmp_path: Path) -> None:
 
 
 def test_a_gate_changes_while_the_node_runs(rig: Rig, process: Process) -> None:
-    client = rig.create_client(SetParameters, "/pose_graph_node/set_parameters")
-    assert client.wait_for_service(20.0)
     wanted = Parameter("pose_graph.max_closure_m", value=0.001).to_parameter_msg()
     wrong = Parameter("pose_graph.gate_chi2", value=-1.0).to_parameter_msg()
     fixed = Parameter("pose_graph.max_gap_s", value=9.0).to_parameter_msg()
-    future = client.call_async(SetParameters.Request(parameters=[wanted, wrong, fixed]))
-    rig.until(future.done)
-    assert [result.successful for result in future.result().results] == [True, False, False]
+    request = SetParameters.Request(parameters=[wanted, wrong, fixed])
+    answer = call_service(rig, SetParameters, "/pose_graph_node/set_parameters", request)
+    assert [result.successful for result in answer.results] == [True, False, False]
     rig.until(lambda: rig.closures.get_subscription_count())
     rig.closures.publish(closure_to_message(rig.world.message(0)))
     rig.until(lambda: any("absurd translation" in name for name in rig.values))
@@ -379,11 +375,8 @@ def test_edges_are_edited_by_hand_and_undone_by_name(rig: Rig, process: Process,
     rig.until(lambda: len(verdicts(rig)) == len(rig.world.closures))
 
     def call(service: str, text: str) -> AddDiagnostics.Response:
-        client = rig.create_client(AddDiagnostics, f"/pose_graph_node/{service}")
-        assert client.wait_for_service(20.0)
-        future = client.call_async(AddDiagnostics.Request(load_namespace=text))
-        rig.until(future.done)
-        return future.result()
+        request = AddDiagnostics.Request(load_namespace=text)
+        return call_service(rig, AddDiagnostics, f"/pose_graph_node/{service}", request)
 
     right = next(name for name, verdict in verdicts(rig).items() if verdict == "accepted")
     answer = call("reject_edge", right)

@@ -183,7 +183,7 @@ def test_the_summary_can_be_written_while_the_run_goes_on_in_another_thread(tmp_
 
 
 def lines(path: Path) -> list[str]:
-    return path.read_text().splitlines()
+    return path.read_text(encoding="utf-8").splitlines()
 
 
 def test_a_folder_with_results_is_continued(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
+import threading
 import zipfile
 from collections.abc import Sequence
 from contextlib import suppress
@@ -35,6 +36,8 @@ MODEL_SUFFIX = ".openvino"
 """Suffix of the zip archive of `model.xml` and `model.bin` beside a weights file."""
 FACTS = "umf_ros"
 """Section of a model's `rt_info`: `precision`, and `weights`, the SHA-256 of the weights it was made from."""
+
+_LOADING = threading.Lock()
 
 
 class OpenVinoRuntime:
@@ -133,8 +136,9 @@ def make_runtime(weights: Path, settings: EmbeddingSettings, outputs: tuple[str,
     XFeat reads images (1, 1, H, W) whose sides are multiples of 32 pixels. Its outputs are descriptors
     (64, H / 8, W / 8), corners (1, H, W), the probabilities of key points, and reliability (1, H / 8, W / 8).
 
-    The first inference runs in the thread that makes the runtime, before any other thread uses the library: OpenVINO's
-    binding initialises itself then, and two threads that do so at the same moment deadlock.
+    One thread loads at a time, up to the first inference. OpenVINO's binding initialises itself in that inference, and
+    two threads that do so at once deadlock; while it reads a model it sets the locale of the process to C, and two
+    threads that do so at once leave it there; an import during another one fails.
 
     Args:
         weights: safetensors file of the network.
@@ -150,12 +154,13 @@ def make_runtime(weights: Path, settings: EmbeddingSettings, outputs: tuple[str,
     blank: Arrays = [np.zeros(XFEAT_SHAPE, np.float32)] if of_xfeat else blank_input(read_config(weights))
     threads = settings.threads or max(1, len(os.sched_getaffinity(0)) // 2)
     runtime: Runtime
-    if _wants_openvino(weights, settings):
-        runtime = OpenVinoRuntime(weights, outputs, threads)
-    else:
-        runtime = TorchRuntime(weights, outputs, settings.device, threads)
-    with reading(weights, WeightsError, "cannot be run"):
-        runtime.run(blank)
+    with _LOADING:
+        if _wants_openvino(weights, settings):
+            runtime = OpenVinoRuntime(weights, outputs, threads)
+        else:
+            runtime = TorchRuntime(weights, outputs, settings.device, threads)
+        with reading(weights, WeightsError, "cannot be run"):
+            runtime.run(blank)
     return runtime
 
 

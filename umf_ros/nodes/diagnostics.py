@@ -34,7 +34,7 @@ def status(level: bytes, name: str, message: str, values: Mapping[str, object]) 
 
 def memory_mb() -> float:
     """Return the current resident memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
     return pages * resource.getpagesize() / 2**20
 
 

@@ -265,7 +265,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 def peak_memory_mb() -> float:
     """Return the peak resident memory of this process; `getrusage` would count that of the process that started it."""
-    lines = Path("/proc/self/status").read_text().splitlines()
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
 
 

@@ -25,12 +25,12 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("one", "other"):
         np.save(f"{name}.npy", rng.uniform(-20, 20, (3000, 4)).astype(np.float32))
         cv2.imwrite(f"{name}.png", rng.integers(0, 255, (48, 64), np.uint8))
-    Path("calibration.yaml").write_text(CALIBRATION)
+    Path("calibration.yaml").write_text(CALIBRATION, encoding="utf-8")
     return tmp_path
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
+    with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
@@ -70,7 +70,7 @@ def test_a_defect_costs_one_pair_only(here: Path, monkeypatch: pytest.MonkeyPatc
         raise np.linalg.LinAlgError("singular\nmatrix")
 
     monkeypatch.setattr("umf_ros.lab.evaluation.comparison.Comparer.compare", fail)
-    Path("pairs.csv").write_text("match_scan,query_scan\none.npy,other.npy\none.npy,one.npy\n")
+    Path("pairs.csv").write_text("match_scan,query_scan\none.npy,other.npy\none.npy,one.npy\n", encoding="utf-8")
     ended = umf("compare", "--list", "pairs.csv", "--out", "verdicts.csv")
     assert ended.status == 1 and ended.err.splitlines() == [
         "pair 1: LinAlgError: singular matrix",
@@ -80,11 +80,11 @@ def test_a_defect_costs_one_pair_only(here: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_results_of_an_earlier_list_are_not_touched(here: Path) -> None:
-    Path("pairs.csv").write_text("match_scan,query_scan\none.npy,other.npy\n")
-    Path("verdicts.csv").write_text("results of another list\n")
+    Path("pairs.csv").write_text("match_scan,query_scan\none.npy,other.npy\n", encoding="utf-8")
+    Path("verdicts.csv").write_text("results of another list\n", encoding="utf-8")
     said = only_line(umf("compare", "--list", "pairs.csv", "--out", "verdicts.csv"))
     assert "verdicts.csv exists already" in said
-    assert Path("verdicts.csv").read_text() == "results of another list\n"
+    assert Path("verdicts.csv").read_text(encoding="utf-8") == "results of another list\n"
 
 
 def test_images_are_named_as_views_or_beside_them(here: Path) -> None:

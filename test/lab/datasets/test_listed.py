@@ -36,7 +36,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
 
 def write_list(path: Path, *sequences: dict[str, object]) -> Path:
     path.parent.mkdir(exist_ok=True)
-    path.write_text(yaml.safe_dump(list(sequences)))
+    path.write_text(yaml.safe_dump(list(sequences)), encoding="utf-8")
     return path
 
 

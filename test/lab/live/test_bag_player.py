@@ -111,7 +111,7 @@ def test_ctrl_c_ends_a_loop_cleanly_after_more_than_one_turn(ros_context: None, 
 
 def segments(player: subprocess.Popen[str]) -> list[int]:
     """Sizes of the pieces of memory through which a process of Fast DDS sends."""
-    mapped = Path(f"/proc/{player.pid}/maps").read_text().splitlines()
+    mapped = Path(f"/proc/{player.pid}/maps").read_text(encoding="utf-8").splitlines()
     names = {line.split()[-1] for line in mapped if "/dev/shm/fastrtps_" in line and "_el" not in line}
     return [Path(name).stat().st_size for name in names if Path(name).exists()]
 

@@ -42,7 +42,7 @@ def ignore(*_: object) -> None:
 
 
 def rows(path: Path) -> list[dict[str, str]]:
-    with path.open() as stream:
+    with path.open(encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
 
 

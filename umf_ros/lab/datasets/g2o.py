@@ -250,7 +250,9 @@ def write_plane(path: Path, poses: Array, edges: ArrayLike, ids: Sequence[int] |
     places, steps = (np.column_stack([one[:, :2, 3], heading(one)]) for one in (poses, measured["pose"]))
     lines = g2o_lines("VERTEX_SE2", [(name,) for name in names], places)
     with writing(path):
-        path.write_text("".join(lines + g2o_lines("EDGE_SE2", pairs, np.hstack([steps, information]))))
+        path.write_text(
+            "".join(lines + g2o_lines("EDGE_SE2", pairs, np.hstack([steps, information]))), encoding="utf-8"
+        )
 
 
 def write_optimised(path: Path, graph: PoseGraph, recording: GraphRecording, planar: bool) -> None:
