@@ -157,6 +157,9 @@ class Verifier:
             if self._promises(one, least):
                 self._look_elsewhere(one)
             one.probability = self._probability(one)
+            if "rival_far" in one.measurements and self._objection(one) is None:
+                theirs, ours = one.scans
+                one.measurements |= known_only({"repetition": repetition(theirs, ours, one.pose)})
         return aligned
 
     def _promises(self, hypothesis: Hypothesis, least: float) -> bool:
@@ -176,7 +179,6 @@ class Verifier:
         found = locate_along(theirs, ours, hypothesis.pose)
         if found is None:
             hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
-            hypothesis.measurements |= known_only({"repetition": repetition(theirs, ours, hypothesis.pose)})
             return
         hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
         self._measure(hypothesis)
