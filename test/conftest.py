@@ -38,10 +38,13 @@ MARKED = {
 }
 """Markers by folders and files of tests; `make check` leaves all of them out."""
 LONG = (
-    *("submaps/test_finder.py", "commands/test_replay.py", "test_detector.py", "nodes", "commands/test_map", "maps"),
-    *("lab/evaluation", "lab/simulation", "lab/training", "fleet", "benchmarks", "bags"),
+    *("nodes/test_live_graph.py", "submaps/test_finder.py", "test_detector.py", "commands/test_replay.py", "nodes"),
+    *("commands/test_map", "maps", "lab/evaluation", "lab/simulation", "lab/training", "fleet", "benchmarks", "bags"),
 )
-"""Folders and files of tests that take longest: they begin first, so that no worker ends long after the others."""
+"""Folders and files of tests that take longest: they begin first, so that no worker ends long after the others.
+
+The first one simulates the small recording; those beside it do without.
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -36,17 +36,17 @@ def rough_ground(seed: int) -> Array:
     return np.c_[xy, z - 1.2]
 
 
-def there_and_back() -> list[Array]:
-    """`world_T_body` along 42 m, and back 2 m beside it."""
-    metres = np.arange(0, OUT_M, STEP_M)
+def there_and_back(out_m: float) -> list[Array]:
+    """`world_T_body` along a line, and back 2 m beside it."""
+    metres = np.arange(0, out_m, STEP_M)
     turned = Rotation.from_euler("z", 180, degrees=True).as_matrix()
     out = [make_pose(np.eye(3), [x, 0, 0]) for x in metres]
     return out + [make_pose(turned, [x, ASIDE_M, 0]) for x in metres[::-1]]
 
 
-def drive(ground: Array, drift: float = 0.01, half_width_rad: float = 0.61) -> Drive:
+def drive(ground: Array, drift: float = 0.01, half_width_rad: float = 0.61, out_m: float = OUT_M) -> Drive:
     """Keyframes with a LiDAR, 70 deg wide unless told otherwise, and odometry that thinks every step too long."""
-    truth, rng = there_and_back(), np.random.default_rng(0)
+    truth, rng = there_and_back(out_m), np.random.default_rng(0)
     keyframes, odom, path_length = [], np.eye(4), 0.0
     for i, pose in enumerate(truth):
         if i:

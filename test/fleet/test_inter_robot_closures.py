@@ -92,7 +92,7 @@ def narrow_drive(
 
 
 def test_rovers_with_narrow_lidars_that_drive_in_opposite_directions_get_closures(server: PostgresServer) -> None:
-    outing = drive_lidar(rough_ground(5))
+    outing = drive_lidar(rough_ground(5), out_m=27.0)
     half = len(outing.keyframes) // 2
     there = np.array([pose[0, 3] for pose in outing.truth])
     circle = np.pi * there / there.max()  # alike where they are near
@@ -106,7 +106,7 @@ def test_rovers_with_narrow_lidars_that_drive_in_opposite_directions_get_closure
         for found in narrow_drive(server, "ada", outing, range(half, 2 * half), descriptors)
         for closure in found.closures
     ]
-    assert len(closures) > 10
+    assert len(closures) > half // 4
     for closure in closures:
         expected = relative(true[closure.match_stamp_ns], true[closure.query_stamp_ns + first])
         assert np.linalg.norm(relative(expected, closure.match_T_query)[:3, 3]) < 0.5

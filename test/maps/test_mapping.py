@@ -153,7 +153,7 @@ def test_odometry_comes_from_a_file_of_its_name(tmp_path: Path, opening: Opening
 
 
 def test_a_narrow_lidar_joins_two_sessions_driven_in_opposite_directions(tmp_path: Path) -> None:
-    outing = drive_lidar(rough_ground(5))
+    outing = drive_lidar(rough_ground(5), out_m=27.0)
     half = len(outing.keyframes) // 2
     target = MapFolder.open_or_create(tmp_path / "map", Settings())
     for name, first, last in (("out", 0, half), ("back", half, 2 * half)):

@@ -124,6 +124,7 @@ def process(tmp_path: Path) -> Iterator[Process]:
         tmp_path / "node.log",
         f"results_dir:={tmp_path / 'results'}",
         "pose_graph.max_gap_s:=3",
+        "dataset:=s3li-etna",
     )
     started.wait_for("ready")
     yield started

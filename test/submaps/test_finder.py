@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,12 +17,20 @@ from umf_ros.verification import Hypothesis, RejectReason
 from umf_ros.verification import constants as const
 
 DAY_NS = 86_400 * 10**9
+HALF = 56
+"""Keyframe at which the drive turns."""
+BACK = range(HALF + 14, 2 * HALF, 3)
+"""Some keyframes of the way back that have a submap of the way out beside them."""
 
 
-def replay(outing: Drive, database: PlaceDatabase, **settings: float) -> Iterator[tuple[int, list[Hypothesis]]]:
+def replay(
+    outing: Drive, database: PlaceDatabase, asked: Container[int], **settings: float
+) -> Iterator[tuple[int, list[Hypothesis]]]:
+    """What is found about the keyframes that are asked about, of a drive whose keyframes are all remembered."""
     finder = SubmapFinder(Verification(**settings), Loop(), database)
     for i, keyframe in enumerate(outing.keyframes):
-        yield i, finder.find(keyframe, [])
+        if i in asked:
+            yield i, finder.find(keyframe, [])
         database.add(keyframe)
         finder.remember(keyframe)
 
@@ -44,7 +52,7 @@ def compared_with(finder: SubmapFinder, query: Keyframe) -> list[Keyframe]:
 def test_a_way_driven_back_is_recognised_with_the_right_pose(outing: Drive, database: PlaceDatabase) -> None:
     stamps = {keyframe.stamp_ns: i for i, keyframe in enumerate(outing.keyframes)}
     closed = set()
-    for i, verdicts in replay(outing, database):
+    for i, verdicts in replay(outing, database, BACK):
         for closure in (verdict.closure for verdict in verdicts if verdict.closure is not None):
             true = relative(outing.truth[stamps[closure.match_stamp_ns]], outing.truth[i])
             error = invert(true) @ closure.match_T_query
@@ -52,33 +60,31 @@ def test_a_way_driven_back_is_recognised_with_the_right_pose(outing: Drive, data
             assert np.degrees(rotation_angle(closure.match_T_query)) > 150
             assert np.linalg.eigvalsh(closure.covariance).min() > 0
             closed.add(i)
-    back = range(len(outing.truth) // 2 + 14, len(outing.truth))
-    assert len(closed & set(back)) > 0.8 * len(back)
+    assert len(closed) > 0.8 * len(BACK)
 
 
 def test_a_limit_on_the_turn_is_kept(outing: Drive, database: PlaceDatabase) -> None:
-    part = Drive(outing.keyframes[:80], outing.truth)
-    verdicts = [verdict for _, found in replay(part, database, max_turn_deg=90.0) for verdict in found]
+    found = replay(outing, database, BACK[:3], max_turn_deg=90.0)
+    verdicts = [verdict for _, some in found for verdict in some]
     assert not any(verdict.closure for verdict in verdicts)
     assert any(verdict.reason is RejectReason.TURNED for verdict in verdicts)
 
 
 def test_what_never_was_seen_is_not_recognised(outing: Drive, database: PlaceDatabase) -> None:
     elsewhere = drive(rough_ground(6))
-    half = len(outing.keyframes) // 2
-    mixed = Drive([*outing.keyframes[:half], *elsewhere.keyframes[half : half + 30]], outing.truth)
-    verdicts = [verdict for _, found in replay(mixed, database) for verdict in found]
+    mixed = Drive([*outing.keyframes[:HALF], *elsewhere.keyframes[HALF : HALF + 30]], outing.truth)
+    verdicts = [verdict for _, found in replay(mixed, database, range(HALF, HALF + 30, 3)) for verdict in found]
     assert verdicts and not any(verdict.closure for verdict in verdicts)
 
 
 def test_without_odometry_there_are_no_submaps(outing: Drive, database: PlaceDatabase) -> None:
     lost = Drive([replace(keyframe, odom_T_body=None) for keyframe in outing.keyframes], outing.truth)
-    assert not any(found for _, found in replay(lost, database))
+    assert not any(found for _, found in replay(lost, database, BACK))
 
 
 def test_a_dense_scan_all_around_needs_no_submap(database: PlaceDatabase) -> None:
     spun = drive(rough_ground(5), half_width_rad=np.pi)
-    assert not any(found for _, found in replay(spun, database))
+    assert not any(found for _, found in replay(spun, database, BACK))
 
 
 def test_a_place_that_a_scan_has_found_is_not_looked_for(outing: Drive, database: PlaceDatabase) -> None:
@@ -100,9 +106,8 @@ def test_odometry_carries_a_closure_to_the_next_keyframes(outing: Drive, databas
         place = Candidate(30, match.stamp_ns, 1.0)
         finder.find(query, [Hypothesis(query.stamp_ns, place, closure=closure)])
         expected_m = later.odom_T_body[0, 3] + metres  # along the way out
-        found = compared_with(finder, later)[
-            -1
-        ]  # where the prediction is wrong, the place nearest to the right pose too
+        # where the prediction is wrong, the place nearest to the right pose too
+        found = compared_with(finder, later)[-1]
         assert found.odom_T_body is not None
         assert found.path_length_m < 45 and abs(found.odom_T_body[0, 3] - expected_m) < 2 * const.MERGE_STEP_M / 3
 
@@ -120,10 +125,10 @@ def test_without_a_closure_odometry_alone_is_trusted_for_a_while(outing: Drive, 
 def test_results_do_not_depend_on_what_is_in_memory(outing: Drive, database: PlaceDatabase) -> None:
     small = PlaceDatabase(Database(cached_keyframes=20), "none", 2)
     part, closures = Drive(outing.keyframes[:80], outing.truth), 0
-    for (_, one), (_, other) in zip(replay(part, database), replay(part, small), strict=True):
+    for (_, one), (_, other) in zip(replay(part, database, BACK), replay(part, small, BACK), strict=True):
         assert [v.outcome for v in one] == [v.outcome for v in other]
         closures += sum(verdict.accepted for verdict in one)
-    assert closures > 5
+    assert closures >= 2
 
 
 def test_odometry_that_drifts_far_gives_no_wrong_closure(outing: Drive, database: PlaceDatabase) -> None:
@@ -132,7 +137,7 @@ def test_odometry_that_drifts_far_gives_no_wrong_closure(outing: Drive, database
         replace(one, odom_T_body=None if one.odom_T_body is None else _stretched(one.odom_T_body))
         for one in outing.keyframes
     ]
-    for i, verdicts in replay(Drive(slow, outing.truth), database):
+    for i, verdicts in replay(Drive(slow, outing.truth), database, BACK):
         for closure in (verdict.closure for verdict in verdicts if verdict.closure is not None):
             error = (
                 invert(relative(outing.truth[stamps[closure.match_stamp_ns]], outing.truth[i])) @ closure.match_T_query
@@ -164,19 +169,20 @@ def test_a_camera_alone_leaves_no_stops_and_asks_for_none(
 def test_a_stored_session_is_found_by_one_driven_the_other_way(
     outing: Drive, database: PlaceDatabase, localizing: bool
 ) -> None:
-    half, closed = len(outing.keyframes) // 2, 0
-    for keyframe in outing.keyframes[:half]:  # stamps of a map may be later than the present
+    closed = 0
+    for keyframe in outing.keyframes[:HALF]:  # stamps of a map may be later than the present
         database.add(replace(keyframe, stamp_ns=keyframe.stamp_ns + localizing * DAY_NS))
     SubmapHistory(database.store).describe(0)
     finder = SubmapFinder(Verification(), Loop(), database, range(1) if localizing else None)
-    start, path_m = outing.keyframes[half].odom_T_body, outing.keyframes[half].path_length_m
+    start, path_m = outing.keyframes[HALF].odom_T_body, outing.keyframes[HALF].path_length_m
     assert start is not None
     stamps = {keyframe.stamp_ns: i for i, keyframe in enumerate(outing.keyframes)}
-    for i, seen in enumerate(outing.keyframes[half:], half):
+    for i, seen in enumerate(outing.keyframes[HALF:], HALF):
         assert seen.odom_T_body is not None
         odometry = relative(start, seen.odom_T_body)  # begins anew
         query = replace(seen, odom_T_body=odometry, session=1, path_length_m=seen.path_length_m - path_m)
-        for closure in (verdict.closure for verdict in finder.find(query, []) if verdict.closure is not None):
+        verdicts = finder.find(query, []) if i in BACK else []
+        for closure in (verdict.closure for verdict in verdicts if verdict.closure is not None):
             match = stamps[closure.match_stamp_ns - localizing * DAY_NS]
             error = invert(relative(outing.truth[match], outing.truth[i])) @ closure.match_T_query
             assert np.linalg.norm(error[:3, 3]) < 0.5
@@ -184,19 +190,18 @@ def test_a_stored_session_is_found_by_one_driven_the_other_way(
         if not localizing:
             database.add(query)
         finder.remember(query)
-    assert closed > 10
+    assert closed > len(BACK) // 2
 
 
 @pytest.mark.parametrize("far", [14, 20])
 def test_a_place_found_from_afar_is_exchanged_for_the_nearest(outing: Drive, database: PlaceDatabase, far: int) -> None:
-    half = len(outing.keyframes) // 2
-    for keyframe in outing.keyframes[:half]:
+    for keyframe in outing.keyframes[:HALF]:
         database.add(keyframe)
     finder = SubmapFinder(Verification(), Loop(), database, range(1))
-    queries = [replace(one, session=1) for one in outing.keyframes[half : half + 25]]
+    queries = [replace(one, session=1) for one in outing.keyframes[HALF : HALF + 25]]
     for one in queries[:-1]:
         finder.remember(one)
-    query, true = queries[-1], outing.truth[half + 24]
+    query, true = queries[-1], outing.truth[HALF + 24]
     assert abs(outing.truth[far][0, 3] - true[0, 3]) > 8
     place = Candidate(far, database[far].stamp_ns, 1.0)
     verdicts = finder.find(query, [Hypothesis(query.stamp_ns, place, probability=0.5)])
@@ -210,13 +215,12 @@ def test_a_place_found_from_afar_is_exchanged_for_the_nearest(outing: Drive, dat
 def test_a_place_too_far_away_is_exchanged_for_one_halfway_where_the_nearest_is_unknown(
     outing: Drive, database: PlaceDatabase
 ) -> None:
-    half = len(outing.keyframes) // 2
-    query, true = replace(outing.keyframes[half + 24], session=1), outing.truth[half + 24]
-    for keyframe, pose in zip(outing.keyframes[:half], outing.truth, strict=False):
+    query, true = replace(outing.keyframes[HALF + 24], session=1), outing.truth[HALF + 24]
+    for keyframe, pose in zip(outing.keyframes[:HALF], outing.truth, strict=False):
         if abs(pose[0, 3] - true[0, 3]) > 1.2 * const.SAME_PLACE_M:
             database.add(keyframe)
     finder = SubmapFinder(Verification(), Loop(), database, range(1))
-    for one in outing.keyframes[half : half + 24]:
+    for one in outing.keyframes[HALF : HALF + 24]:
         finder.remember(replace(one, session=1))
     far = next(row for row in range(len(database)) if true[0, 3] - outing.truth[row][0, 3] < 14)
     place = Candidate(far, database[far].stamp_ns, 1.0)

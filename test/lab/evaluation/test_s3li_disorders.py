@@ -27,5 +27,5 @@ def test_what_changes_figures_without_its_word_is_silent(name: str, changes: dic
 
 @pytest.mark.slow
 def test_positions_that_are_in_utc_are_noticed(tmp_path: Path) -> None:
-    found = run(tmp_path, 20_301, "gps_time")
+    found = run(tmp_path, 20_301, "gps_time", (30.0, 18.0))
     assert verdict("gps_time", found, PLAIN) == "noticed"
