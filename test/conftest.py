@@ -159,7 +159,7 @@ def _simulate_mini(path: Path) -> None:
     def plan(relief: Relief, rng: np.random.Generator) -> Walker:
         return Walker(gentle_loop(relief, 30.0, rng), rng).forward(29).forward(20, lateral_m=0.5)
 
-    look = {"speed_m_s": 2.5, "swing_deg": 2.0, "sun_deg": 15.0, "drift": DEMO.drift}
+    look = {"speed_m_s": 3.0, "swing_deg": 2.0, "sun_deg": 15.0, "drift": DEMO.drift}
     preset = Preset("a small loop", plan, length_m=46, samples=50, **look)
     simulator = Simulator(preset, seed=20_777)
     with BagWriter(path) as bag:

@@ -18,9 +18,9 @@ def located(folder: Path) -> int:
 def test_a_map_that_grew_locates_the_next_drive_as_often_as_a_frozen_one_or_more(
     mini_bag: Path, mini_config: Path, tmp_path: Path
 ) -> None:
-    first = part_of(mini_bag, tmp_path / "first.mcap", 0.0, 10.0)
-    second = part_of(mini_bag, tmp_path / "second.mcap", 3.0)  # begins in the map, leaves it and comes back
-    third = part_of(mini_bag, tmp_path / "third.mcap", 9.0, 15.0)  # begins where the first drive ended
+    first = part_of(mini_bag, tmp_path / "first.mcap", 0.0, 8.0)
+    second = part_of(mini_bag, tmp_path / "second.mcap", 2.5)  # begins in the map, leaves it and comes back
+    third = part_of(mini_bag, tmp_path / "third.mcap", 7.5, 12.5)  # begins where the first drive ended
     out = tmp_path / "map"
     assert umf("map", first, "--config", mini_config, "--out", out).status == 0
     frozen = umf("replay", third, "--config", mini_config, "--map", out, "--out", tmp_path / "frozen")

@@ -21,7 +21,7 @@ from umf_ros.maps.map_folder import MapFolder
 @pytest.fixture(scope="module")
 def recordings(mini_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("parts")
-    return [part_of(mini_bag, folder / f"{name}.mcap", *span) for name, span in (("a", (0, 15)), ("b", (15, 99)))]
+    return [part_of(mini_bag, folder / f"{name}.mcap", *span) for name, span in (("a", (0, 6)), ("b", (10, 14)))]
 
 
 def tables(out: Path) -> dict[str, str]:
