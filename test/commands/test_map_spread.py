@@ -21,7 +21,7 @@ from umf_ros.maps.map_folder import MapFolder
 @pytest.fixture(scope="module")
 def recordings(mini_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("parts")
-    return [part_of(mini_bag, folder / f"{name}.mcap", *span) for name, span in (("a", (0, 6)), ("b", (10, 14)))]
+    return [part_of(mini_bag, folder / f"{name}.mcap", *span) for name, span in (("a", (0, 7)), ("b", (11, 99)))]
 
 
 def tables(out: Path) -> dict[str, str]:
@@ -75,5 +75,6 @@ def test_ray_makes_the_same_map_though_a_worker_is_killed(
     assert ended.status == 0, ended.text
     assert killer.killed
     assert tables(tmp_path / "map") == tables(alone)
+    assert "2 of 2 sessions in one frame" in ended.text
     known = [json.loads((out / "map.json").read_text())["sessions"] for out in (alone, tmp_path / "map")]
     assert known[0] == known[1]
