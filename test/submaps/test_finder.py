@@ -26,7 +26,7 @@ BACK = range(HALF + 14, 2 * HALF, 3)
 def replay(
     outing: Drive, database: PlaceDatabase, asked: Container[int], **settings: float
 ) -> Iterator[tuple[int, list[Hypothesis]]]:
-    """What is found about the keyframes that are asked about, of a drive whose keyframes are all remembered."""
+    """Yield verdicts about some keyframes of a drive; all are remembered."""
     finder = SubmapFinder(Verification(**settings), Loop(), database)
     for i, keyframe in enumerate(outing.keyframes):
         if i in asked:
