@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -137,6 +138,14 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
 ) -> None:
     assert message in only_line(umf(*arguments))
     assert [name for name in left_behind(somewhere_empty) if name != "results"] == []
+
+
+def test_a_name_that_is_not_utf8_is_one_line(somewhere_empty: Path) -> None:
+    name = os.fsdecode(b"m\xfcll.mcap")
+    (somewhere_empty / "drives").mkdir()
+    (somewhere_empty / "drives" / name).touch()
+    for arguments in (["replay", name], ["replay", "drive.mcap", "--out", name], ["map", "drives", "--out", "map"]):
+        assert "m\\udcfcll.mcap' is not UTF-8; rename it" in only_line(umf(*arguments))
 
 
 def test_an_exported_network_can_be_read_by_its_runtime(somewhere_empty: Path) -> None:

@@ -416,6 +416,8 @@ def open_bag(path: str | Path) -> Bag:
         BagError: there is no such recording, it is another kind of file, or it holds no message.
     """
     path = Path(path)
+    if any("\ud800" <= letter <= "\udfff" for letter in str(path)):
+        raise BagError(f"{str(path)!a} is not UTF-8; rename it")
     with reading(path, BagError, "cannot be read"):
         if not path.exists():
             raise BagError(f"there is no recording {path}")
