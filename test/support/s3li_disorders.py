@@ -33,11 +33,11 @@ WORSE = 2.0
 """Times an error of a trajectory, above which a change is not harmless."""
 
 
-def run(folder: Path, seed: int, taken_out: str, lengths_m: tuple[float, float] = LENGTHS_M) -> dict[str, Any]:
-    """Figures of one sequence, with a drive and a loop of these lengths, without one disorder."""
+def run(folder: Path, seed: int, taken_out: str) -> dict[str, Any]:
+    """Figures of one sequence without one disorder."""
     name = VULCANO if taken_out == "baseline" else ETNA
     disorders = Disorders() if taken_out == AS_IT_IS else replace(Disorders(), **{taken_out: False})
-    with patch.multiple(twin, SHORTEST_M=lengths_m[0], SHORTEST_LOOP_M=lengths_m[1]):
+    with patch.multiple(twin, SHORTEST_M=LENGTHS_M[0], SHORTEST_LOOP_M=LENGTHS_M[1]):
         for _ in twin.write_twin(folder, seed, 0.01, (name,), disorders):
             pass
     sequence = find_s3li(folder).sequences[0]

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
-from support.s3li_disorders import AS_IT_IS, run, verdict
+from support.s3li_disorders import AS_IT_IS, verdict
 
 PLAIN = {"warnings": [], "closures_true": 9, "closures_false": 0, "pose_error_m": 0.04, "ate_optimized_m": 0.1}
 
@@ -23,9 +21,3 @@ PLAIN = {"warnings": [], "closures_true": 9, "closures_false": 0, "pose_error_m"
 )
 def test_what_changes_figures_without_its_word_is_silent(name: str, changes: dict, expected: str) -> None:
     assert verdict(name, PLAIN | changes, PLAIN) == expected
-
-
-@pytest.mark.slow
-def test_positions_that_are_in_utc_are_noticed(tmp_path: Path) -> None:
-    found = run(tmp_path, 20_301, "gps_time", (30.0, 18.0))
-    assert verdict("gps_time", found, PLAIN) == "noticed"

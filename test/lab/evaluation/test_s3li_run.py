@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from etna import GPS_MINUS_UTC_NS, entries, write_pos
+from recordings import START_NS, write_mcap
 from spread_tasks import die, refuse, square
 from typer.testing import CliRunner
 
@@ -13,7 +15,7 @@ from umf_ros.cli import umf
 from umf_ros.core.config import Loop
 from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import heading
-from umf_ros.core.trajectory import Trajectory
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.lab.datasets.s3li_folder import S3liFolder, S3liSequence
 from umf_ros.lab.datasets.simulated import poses_of
 from umf_ros.lab.evaluation.s3li_run import (
@@ -26,6 +28,7 @@ from umf_ros.lab.evaluation.s3li_run import (
     precision_of_pairs,
     protocol_table,
     recall_of_places,
+    replay_sequence,
     sequence_table,
     wilson,
 )
@@ -117,6 +120,17 @@ def test_a_clock_of_the_satellites_is_told_by_the_way(late_s: int) -> None:
     stamps, poses = drive(160)
     truth = positions(stamps + late_s * SECOND, poses, turn_deg=70)
     assert clock_lag_s(Trajectory(stamps, poses), truth) == pytest.approx(-late_s, abs=0.51)
+
+
+def test_positions_that_are_in_utc_are_noticed(tmp_path: Path) -> None:
+    stamps, poses = drive(160)
+    recording = write_mcap(tmp_path / "s3li_loops.mcap", entries(1.0, size=(688, 512)))
+    write_tum(tmp_path / "odometry.tum", Trajectory(stamps - stamps[0] + START_NS, poses))
+    for ahead_ns, noticed in ((GPS_MINUS_UTC_NS, False), (0, True)):
+        truth = write_pos(tmp_path / "global.pos", 159, way=lambda s: poses[round(10 * s)], ahead_ns=ahead_ns)
+        one = S3liSequence("s3li_loops", recording, odometry=tmp_path / "odometry.tum", truth=[truth])
+        lines = replay_sequence(one, tmp_path / "run")["warnings"]
+        assert any("18.0 s earlier" in line and "GPS time" in line for line in lines) == noticed, lines
 
 
 def test_headings_come_from_the_odometry_or_else_from_the_course() -> None:

@@ -187,7 +187,8 @@ def replay_sequence(one: S3liSequence, folder: Path) -> Record:
             truth = fixed if fixed.at(run.stamps)[1].mean() >= ENOUGH_FIXED else truth
     about = replace(judge_run(replace(run, truth=truth), recording), sensors=check.report(odometry or run.odometry))
     if found and odometry is not None and (lag := clock_lag_s(odometry, found[1])):
-        late = f"the odometry fits the satellites' positions {-lag:+.1f} s later than their stamps say"
+        off = f"{abs(lag):.1f} s {'later' if lag < 0 else 'earlier'}"
+        late = f"the odometry fits the satellites' positions {off} than their stamps say"
         notes.append(f"{late}: is {found[0].name} in GPS time? its figures are not to be trusted")
     overlay = about.sensors.overlay
     notes += [one.line for one in look_first(replace(about, missed=[])) if one.severity != "note"]

@@ -268,6 +268,7 @@ def record(
         OutputError: the bag cannot be written; nothing is left of it.
     """
     bag.note("simulation", describe(simulator))
+    _ = simulator.world.scene  # once, before several threads ask for it
     with ThreadPoolExecutor(workers) as pool:
         done = 0
         for log_ns, _, topic, message in heapq.merge(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import open3d as o3d
@@ -212,7 +213,6 @@ class World:
         aliasing: 0 (every place is its own) to 1 (clusters, dunes and lumps repeat).
         traits: the numbers drawn for this world.
         relief: the ground.
-        scene: Open3D scene of ground, horizon and rocks.
         solids: normals and brightness of what is not ground, by geometry id.
         textures: tiles for `TEXTURE_PERIODS_M`.
         strata: (256,) float32 brightness of layers by height, repeating every 12.8 m.
@@ -226,7 +226,7 @@ class World:
         keep_clear: Array | None = None,
         relief: Relief | None = None,
     ) -> None:
-        """Build the world; takes some seconds.
+        """Build the world but its scene; takes some seconds.
 
         Args:
             seed: the world's number.
@@ -252,9 +252,10 @@ class World:
             HORIZON: _horizon(self.relief, rng),
             ROCK: scatter_rocks(self.relief, rng, aliasing, clear),
         }
-        self.scene = self._build_scene()
 
-    def _build_scene(self) -> o3d.t.geometry.RaycastingScene:
+    @cached_property
+    def scene(self) -> o3d.t.geometry.RaycastingScene:
+        """Ground, horizon and rocks for rays; building it takes most of the time that a world takes."""
         scene = o3d.t.geometry.RaycastingScene()
         axis = (np.arange(CELLS, dtype=np.float32) * CELL_M) - SIZE_M / 2
         x, y = np.meshgrid(axis, axis)
