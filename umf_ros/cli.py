@@ -12,7 +12,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from umf_ros import __version__
-from umf_ros.core.errors import UmfError, one_line, shortened
+from umf_ros.core.errors import UmfError, check_utf8, one_line, shortened
 from umf_ros.core.resources import FLEET_PACKAGES, LAB_PACKAGES
 
 COMMANDS = {
@@ -95,16 +95,13 @@ def main() -> NoReturn:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         for word in sys.argv:
-            word.encode()  # what is not UTF-8 can be neither stored nor printed
+            check_utf8(word, UmfError)
         sys.exit(umf()(prog_name="umf"))  # also when it is run as a module
     except UmfError as error:
         typer.echo(f"umf: {error}", err=True)
         sys.exit(1)
     except ModuleNotFoundError as error:
         typer.echo(f"umf: {error.name} is not installed; {_remedy(str(error.name).split('.')[0])}", err=True)
-        sys.exit(1)
-    except UnicodeEncodeError as error:
-        typer.echo(f"umf: {shortened(ascii(error.object))} is not UTF-8; rename it", err=True)
         sys.exit(1)
     except MemoryError:
         typer.echo("umf: out of memory", err=True)

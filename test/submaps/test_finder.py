@@ -79,12 +79,12 @@ def test_what_never_was_seen_is_not_recognised(outing: Drive, database: PlaceDat
 
 def test_without_odometry_there_are_no_submaps(outing: Drive, database: PlaceDatabase) -> None:
     lost = Drive([replace(keyframe, odom_T_body=None) for keyframe in outing.keyframes], outing.truth)
-    assert not any(found for _, found in replay(lost, database, BACK))
+    assert not any(found for _, found in replay(lost, database, range(2 * HALF)))
 
 
 def test_a_dense_scan_all_around_needs_no_submap(database: PlaceDatabase) -> None:
     spun = drive(rough_ground(5), half_width_rad=np.pi)
-    assert not any(found for _, found in replay(spun, database, BACK))
+    assert not any(found for _, found in replay(spun, database, range(2 * HALF)))
 
 
 def test_a_place_that_a_scan_has_found_is_not_looked_for(outing: Drive, database: PlaceDatabase) -> None:
@@ -128,7 +128,7 @@ def test_results_do_not_depend_on_what_is_in_memory(outing: Drive, database: Pla
     for (_, one), (_, other) in zip(replay(part, database, BACK), replay(part, small, BACK), strict=True):
         assert [v.outcome for v in one] == [v.outcome for v in other]
         closures += sum(verdict.accepted for verdict in one)
-    assert closures >= 2
+    assert closures > 2
 
 
 def test_odometry_that_drifts_far_gives_no_wrong_closure(outing: Drive, database: PlaceDatabase) -> None:

@@ -27,7 +27,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from zstandard import ZstdError, frame_content_size
 
-from umf_ros.core.errors import BagError, MessageError, one_line, reading
+from umf_ros.core.errors import BagError, MessageError, check_utf8, one_line, reading
 from umf_ros.sensors.decode import LIVOX
 
 LARGEST_CHUNK = 2**28
@@ -413,11 +413,10 @@ def open_bag(path: str | Path) -> Bag:
     A truncated recording is opened up to its last readable message; `Bag.warning` is set.
 
     Raises:
-        BagError: there is no such recording, it is another kind of file, or it holds no message.
+        BagError: there is no such recording, its name is not UTF-8, it is another kind of file, or it holds no message.
     """
     path = Path(path)
-    if any("\ud800" <= letter <= "\udfff" for letter in str(path)):
-        raise BagError(f"{str(path)!a} is not UTF-8; rename it")
+    check_utf8(path, BagError)
     with reading(path, BagError, "cannot be read"):
         if not path.exists():
             raise BagError(f"there is no recording {path}")

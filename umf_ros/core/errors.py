@@ -15,6 +15,18 @@ def shortened(text: object) -> str:
     return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 3 :]}"
 
 
+def check_utf8(name: object, kind: type[UmfError]) -> None:
+    """Check a name: one that is not UTF-8 can be neither stored nor printed.
+
+    Raises:
+        kind: it is not.
+    """
+    try:
+        str(name).encode()
+    except UnicodeEncodeError:
+        raise kind(f"{shortened(ascii(str(name)))} is not UTF-8; rename it") from None
+
+
 def one_line(error: BaseException) -> str:
     """Return the text of an exception on one line; its type where it has none."""
     return shortened(error) or type(error).__name__

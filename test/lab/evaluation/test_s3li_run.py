@@ -9,6 +9,7 @@ import pytest
 from etna import GPS_MINUS_UTC_NS, entries, write_pos
 from recordings import START_NS, write_mcap
 from spread_tasks import die, refuse, square
+from support.s3li_disorders import verdict
 from typer.testing import CliRunner
 
 from umf_ros.cli import umf
@@ -129,8 +130,9 @@ def test_positions_that_are_in_utc_are_noticed(tmp_path: Path) -> None:
     for ahead_ns, noticed in ((GPS_MINUS_UTC_NS, False), (0, True)):
         truth = write_pos(tmp_path / "global.pos", 159, way=lambda s: poses[round(10 * s)], ahead_ns=ahead_ns)
         one = S3liSequence("s3li_loops", recording, odometry=tmp_path / "odometry.tum", truth=[truth])
-        lines = replay_sequence(one, tmp_path / "run")["warnings"]
-        assert any("18.0 s earlier" in line and "GPS time" in line for line in lines) == noticed, lines
+        found = replay_sequence(one, tmp_path / "run")
+        assert any("18.0 s earlier" in line for line in found["warnings"]) == noticed, found["warnings"]
+        assert (verdict("gps_time", found, {}) == "noticed") == noticed
 
 
 def test_headings_come_from_the_odometry_or_else_from_the_course() -> None:
