@@ -43,7 +43,7 @@ def loops(count: int, odometry: float, closures: float, seed: int = 0) -> Loops:
 def take(estimator: NoiseScaleEstimator, found: Loops, first_place: int = 0) -> None:
     """Ten loops of each place."""
     for start in range(0, len(found), 10):
-        estimator.add(found[start : start + 10], first_place + start)
+        estimator.add(found[start : start + 10], found[start : start + 10], first_place + start)
 
 
 def wrong(count: int, metres: float) -> Loops:
@@ -140,9 +140,9 @@ def test_wrong_closures_are_seen_through(metres: float) -> None:
 def test_the_order_of_loops_does_not_matter() -> None:
     together, apart = NoiseScaleEstimator(), NoiseScaleEstimator()
     found = loops(60, 3.0, 1.0)
-    together.add(found, 0)
+    together.add(found, found, 0)
     for row in reversed(range(60)):
-        apart.add(found[row : row + 1], 0)
+        apart.add(found[row : row + 1], found[row : row + 1], 0)
     assert together.scale == apart.scale and apart.loops == 60
 
 
@@ -150,15 +150,15 @@ def test_few_loops_change_nothing() -> None:
     estimator = NoiseScaleEstimator()
     take(estimator, loops(9, 10.0, 1.0))
     assert estimator.scale == NoiseScale()
-    estimator.add(np.empty(0, LOOP), 0)
+    estimator.add(np.empty(0, LOOP), np.empty(0, LOOP), 0)
     assert estimator.loops == 9
 
 
 def test_one_place_does_not_make_all_closures_worse() -> None:
     """Two wrong groups that overlap miss each other by little there: it looks like the noise of closures."""
-    one, many = NoiseScaleEstimator(), NoiseScaleEstimator()
-    one.add(loops(200, 1.0, 4.0), 7)
-    take(many, loops(200, 1.0, 4.0))
+    one, many, found = NoiseScaleEstimator(), NoiseScaleEstimator(), loops(200, 1.0, 4.0)
+    one.add(found, found, 7)
+    take(many, found)
     assert one.scale.closures == 1.0
     assert many.scale.closures == pytest.approx(4.0, rel=0.3)
 
@@ -167,6 +167,23 @@ def test_odometry_is_not_believed_to_be_much_better_than_it_says() -> None:
     estimator = NoiseScaleEstimator()
     take(estimator, loops(300, 0.05, 1.0))
     assert estimator.scale == NoiseScale(odometry=0.3)
+
+
+def test_the_axis_that_drifts_decides() -> None:
+    """Gravity keeps roll and pitch of a rover ten times as well as stated, but not the heading."""
+    estimator, found = NoiseScaleEstimator(), loops(300, 0.1, 1.0)
+    heading = loops(300, 1.0, 1.0, seed=1)["residual"][:, 2]
+    latest = as_loops(found["residual"], found["odometry"], found["closures"])
+    found["residual"][:, 2] = heading
+    for row in range(0, 300, 3):
+        estimator.add(latest[row : row + 3], found[row : row + 3], row)
+    assert estimator.scale.odometry == 1.0
+
+
+def test_wrong_closures_do_not_make_an_axis_drift() -> None:
+    estimator, right = NoiseScaleEstimator(), loops(300, 0.4, 1.0)
+    take(estimator, np.concatenate([right, wrong(300, 5.0)]))
+    assert estimator.scale.odometry == pytest.approx(0.4, rel=0.3)
 
 
 def test_other_units_keep_the_ratio_of_odometry_and_closures() -> None:

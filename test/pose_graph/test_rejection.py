@@ -111,7 +111,7 @@ def test_what_was_rejected_comes_back_when_the_map_moves() -> None:
 
 
 def test_closures_near_the_moved_map_are_compared_again() -> None:
-    world = closing(two_laps(bias=TURN), lap_pairs(0, *range(30, 60, 3)), noise=1.0)
+    world = closing(two_laps(bias=TURN), lap_pairs(0, *range(30, 57, 3)), noise=1.0)
     graph = driven(world, stated=2.0)
     for row in range(len(world.closures)):
         graph.add_closure(world.message(row))

@@ -5,10 +5,10 @@ stated covariances: then both are consistent [Mangelson 2018], updated with each
 grows as the area of the predicted pose shrinks relative to the area in which wrong closures to similar places are
 found. Closures of one place count once.
 
-Over many loops the factor by which residuals do not fit is found by maximum likelihood. Loops with a wrong closure are
-outliers of that likelihood, and wrong closures that are consistent with each other do no harm: they are so through the
-same true odometry. Two wrong sets that overlap look like noise of closures worse than stated: no single place decides
-about that.
+Over many loops the factor by which residuals do not fit is found by maximum likelihood, and not smaller than any axis
+needs. Loops with a wrong closure are outliers of that likelihood, and wrong closures that are consistent with each
+other do no harm: they are so through the same true odometry. Two wrong sets that overlap look like noise of closures
+worse than stated: no single place decides about that.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, adjoint, invert, logmap, propagate
@@ -37,13 +38,10 @@ _GRID = np.exp(np.linspace(np.log(1 / 64), np.log(64), 33))
 # standard deviations of the residual of a loop with a wrong closure: of nearby aliases, and of any place
 _ALIAS_SIGMAS = np.array([[0.5] * 3 + [5.0] * 3, [1.5] * 3 + [50.0] * 3])
 _OUTLIERS = 0.5
-# loops share closures and odometry, so their joint evidence is less than their sum: a smaller scale of odometry needs
-# more evidence than a larger one
-_NATS_PER_FACTOR, _NATS_TO_TRUST = 5.0, 20.0
+_NATS_PER_FACTOR = 5.0
 _FEWEST_LOOPS = 10
 _TOLERANCE = np.log(1.8)
-_SAME_UNITS = np.log(4.0)
-# a systematic error hardly shows in short loops, unless all noise is stated in other units
+# the first loops are too short to show drift, unless all noise is stated in other units
 _LEAST_ODOMETRY = 0.3
 
 
@@ -216,7 +214,7 @@ class ConsistencyGraph:
 
 
 class NoiseScaleEstimator:
-    """Sums of the log-likelihood of both factors on a grid, by loop and place.
+    """Sums of the log-likelihood of both factors on a grid: of all axes together, by place, and of each axis.
 
     Attributes:
         loops: number of added loops.
@@ -226,15 +224,27 @@ class NoiseScaleEstimator:
         logs = np.log(_GRID)
         # one decade off is two sigmas: a few loops cannot move a stated covariance
         self._likelihood = -0.5 * ((logs[:, None] / 1.15) ** 2 + (logs[None, :] / 1.15) ** 2)
+        self._of_axis = np.stack([self._likelihood] * _DEGREES)
         self._of_place: dict[int, Array] = {}
         self.loops = 0
 
-    def add(self, loops: Loops, place: int) -> None:
-        """Add N loops of one place, which may have loops already."""
-        new = _likelihoods(loops).sum(axis=0)
+    def add(self, latest: Loops, spread: Loops, place: int) -> None:
+        """Add loops of one place, which may have loops already.
+
+        Args:
+            latest: (N,) loops with the closures just before, which tell the noise.
+            spread: (M,) loops with near and far ones, which tell the drift.
+            place: number of the place.
+        """
+        new = np.logaddexp(*_likelihoods(latest)).sum(axis=0)
         self._of_place[place] = self._of_place.get(place, 0.0) + new
         self._likelihood = self._likelihood + new
-        self.loops += len(loops)
+        self.loops += len(latest)
+        # a loop counts for single axes as far as all together take it for right, by the stated noise at least
+        odometry, closures = np.unravel_index(np.argmax(self._likelihood), self._likelihood.shape)
+        best = max(odometry, len(_GRID) // 2), closures
+        right, wrong = (likelihoods[:, *best] for likelihoods in np.broadcast_arrays(*_likelihoods(spread)))
+        self._of_axis += np.tensordot(expit(right - wrong), _likelihoods_by_axis(spread), axes=1)
 
     @property
     def scale(self) -> NoiseScale:
@@ -244,20 +254,19 @@ class NoiseScaleEstimator:
         one = len(_GRID) // 2
         # a factor needs a minimum of evidence, else noise in few loops would be taken for a wrong scale
         cost = np.where(np.arange(len(_GRID)) == one, 0.0, _NATS_PER_FACTOR)
-        trusting = np.where(np.arange(len(_GRID)) < one, _NATS_TO_TRUST - _NATS_PER_FACTOR, 0.0)
-        merit = self._likelihood - (cost + trusting)[:, None] - cost
+        merit = self._likelihood - cost[:, None] - cost
         plain = int(np.argmax(merit[:, one])), one
         best = int(np.argmax(merit) // len(_GRID)), int(np.argmax(merit) % len(_GRID))
         accepted = best[1] <= one or self._is_widely_better(best, plain)
         # closures about as stated are taken as stated, and odometry is estimated given that
         row, column = best if accepted and _significant(_GRID[best[1]]) != 1 else plain
-        odometry_factor, closures_factor = float(_GRID[row]), float(_GRID[column])
-        if one not in (row, column) and abs(np.log(odometry_factor / closures_factor)) < _SAME_UNITS:
-            # a common factor of units is likelier than two errors: the ratio counts, and it is as stated
-            odometry_factor = closures_factor = max(odometry_factor, closures_factor)
-        closures_factor = _significant(closures_factor)
+        # the axis that drifts most decides: gravity keeps roll and pitch upright, not the heading
+        by_axis = self._of_axis[:, :, column]
+        gains = np.maximum.accumulate(by_axis[:, ::-1], axis=1)[:, ::-1] - by_axis  # by a larger factor
+        row += int(np.argmax((gains <= _NATS_PER_FACTOR).all(axis=0)[row:]))
+        odometry_factor, closures_factor = _significant(float(_GRID[row])), _significant(float(_GRID[column]))
         least = _LEAST_ODOMETRY * min(closures_factor, 1.0)
-        return NoiseScale(max(_significant(odometry_factor), least), closures_factor)
+        return NoiseScale(max(odometry_factor, least), closures_factor)
 
     def _is_widely_better(self, one: tuple[int, int], other: tuple[int, int]) -> bool:
         """Return whether one choice is better even without the place that favours it most."""
@@ -269,18 +278,36 @@ def _significant(factor: float) -> float:
     return factor if abs(np.log(factor)) > _TOLERANCE else 1.0
 
 
-def _likelihoods(loops: Loops) -> Array:
-    """Return (N, G, G) log-likelihood of each loop over the grids of odometry and closure factors."""
-    residuals = loops["residual"]
+def _likelihoods(loops: Loops) -> tuple[Array, Array]:
+    """Return log-likelihoods of N loops with right closures over the grids, (N, G, G), and with a wrong one, (N, 1, 1).
+
+    The grids are those of odometry and closure factors.
+    """
     # whiten by the closures' noise, then turn the odometry's to its axes: both become diagonal
     lower = np.linalg.cholesky(loops["closures"])
     white = np.linalg.solve(lower, np.swapaxes(np.linalg.solve(lower, loops["odometry"]), -1, -2))
     gains, turns = np.linalg.eigh(0.5 * (white + np.swapaxes(white, -1, -2)))
-    turned = np.swapaxes(turns, -1, -2) @ np.linalg.solve(lower, residuals[..., None])
-    spread = _GRID[:, None, None] ** 2 * np.maximum(gains, 0)[:, None, None, :] + _GRID[None, :, None] ** 2
-    determinant = 2 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
-    inlier = -0.5 * ((turned[..., 0] ** 2)[:, None, None, :] / spread + np.log(spread)).sum(axis=-1)
-    inlier -= 0.5 * determinant[:, None, None]
-    squares = ((residuals[:, None, :] / _ALIAS_SIGMAS) ** 2).sum(axis=-1)
-    outlier = np.logaddexp.reduce(-0.5 * squares - np.log(_ALIAS_SIGMAS).sum(axis=-1), axis=-1)
-    return np.logaddexp(np.log(1 - _OUTLIERS) + inlier, np.log(_OUTLIERS / 2) + outlier[:, None, None])
+    turned = np.swapaxes(turns, -1, -2) @ np.linalg.solve(lower, loops["residual"][..., None])
+    right = _log_densities(turned[..., 0], np.maximum(gains, 0), np.ones_like(gains)).sum(axis=1)
+    right -= np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)[:, None, None]
+    wrong = np.logaddexp.reduce(_alias_densities(loops).sum(axis=-1), axis=-1)
+    return np.log(1 - _OUTLIERS) + right, np.log(_OUTLIERS / 2) + wrong[:, None, None]
+
+
+def _likelihoods_by_axis(loops: Loops) -> Array:
+    """Return (N, 6, G, G) log-likelihoods of each axis of N loops over the grids of odometry and closure factors."""
+    variances = (np.diagonal(loops[noise], axis1=-2, axis2=-1) for noise in ("odometry", "closures"))
+    right = _log_densities(loops["residual"], *variances)
+    wrong = np.logaddexp.reduce(_alias_densities(loops), axis=1)[..., None, None]
+    return np.logaddexp(np.log(1 - _OUTLIERS) + right, np.log(_OUTLIERS / 2) + wrong)
+
+
+def _log_densities(residuals: Array, odometry: Array, closures: Array) -> Array:
+    """Return (N, K, G, G) logarithms of normal densities of (N, K) residuals over the grids; variances (N, K)."""
+    variances = _GRID[:, None] ** 2 * odometry[..., None, None] + _GRID**2 * closures[..., None, None]
+    return -0.5 * (residuals[..., None, None] ** 2 / variances + np.log(variances))
+
+
+def _alias_densities(loops: Loops) -> Array:
+    """Return (N, 2, 6) logarithms of the densities of N residuals if a closure is wrong, by kind of alias and axis."""
+    return -0.5 * (loops["residual"][:, None] / _ALIAS_SIGMAS) ** 2 - np.log(_ALIAS_SIGMAS)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError
-from umf_ros.core.geometry import Array, invert, logmap
+from umf_ros.core.geometry import Array, evenly, invert, logmap
 from umf_ros.pose_graph.closures import (
     ClosureReason,
     Closures,
@@ -204,7 +204,8 @@ class OutlierRejection:
     def _take(self, placed: PlacedClosure) -> int:
         row = len(self.placed)
         loops = self._consistency.add(as_closures(placed, row, self._sessions.chains))
-        self._estimator.add(loops[-_LOOPS_PER_CLOSURE:], self._consistency.place_of[row])
+        spread = loops[evenly(len(loops), _LOOPS_PER_CLOSURE)]
+        self._estimator.add(loops[-_LOOPS_PER_CLOSURE:], spread, self._consistency.place_of[row])
         self.placed.append(placed)
         self.verdicts.append(ClosureVerdict(placed.closure, State.PENDING, ClosureReason.UNSURE))
         self._ratios.append(1.0)
