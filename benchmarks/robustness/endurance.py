@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -35,7 +34,7 @@ from rich.table import Table
 from umf_ros.core.config import Database, Loop
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Embedding
-from umf_ros.core.io import atomic_write
+from umf_ros.core.io import atomic_write, memory_mb
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.runs.run_file import NAME, RunFile
 
@@ -147,23 +146,18 @@ def fuzz(part: str, task: Task, count: int, rng: np.random.Generator) -> Figures
     return {f"fuzz_{part}": count, "fuzz_crashes": crashes, "fuzz_uncounted": outcome["uncounted"]}
 
 
-def resident() -> int:
-    """Bytes of memory of this process."""
-    return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
 def many_places(rng: np.random.Generator, count: int = 100_000) -> Figures:
     """Memory per place, and the time of a query among them."""
     places = PlaceDatabase(Database(), "noise", 256)
     descriptors = rng.standard_normal((1000, 256)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    before = resident()
+    before = memory_mb()
     blank = some_keyframe(0, rng)
     for number in range(count):
         seen = Embedding(descriptors[number % 1000])
         stamp_ns, session = number * 10**9, number // 1000
         places.add(replace(blank, stamp_ns=stamp_ns, embedding=seen, session=session, path_length_m=float(number)))
-    used = resident() - before
+    used = (memory_mb() - before) * 2**20
     query = replace(some_keyframe(count * 10**9 + 10**12, rng), embedding=Embedding(descriptors[3]))
     times = [timed(lambda: places.query(query, Loop())) for _ in range(30)]
     wall, cpu = np.median(times, axis=0).round(2).tolist()

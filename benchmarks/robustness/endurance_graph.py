@@ -18,6 +18,7 @@ from std_srvs.srv import Trigger
 
 from umf_ros.core.config import load_settings
 from umf_ros.core.geometry import Array
+from umf_ros.core.io import memory_mb
 from umf_ros.durable_graph import DurableGraph
 from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops
@@ -133,7 +134,7 @@ def live(poses: int, folder: Path) -> Figures:
         waited = [1e3 * (ears.verdicts[pair] - then_s) for pair, then_s in told_s.items() if pair in ears.verdicts]
         figures |= spread("verdict_ms_20k", np.array(waited)) | {"verdicts_missing": len(told_s) - len(waited)}
         figures["live_stall_ms_20k"] = ears.value(BACK_END, "pose graph", "executor_stall_max_ms")
-        figures["memory_mb_20k"] = _memory_mb(node.process.pid)
+        figures["memory_mb_20k"] = round(memory_mb(node.process.pid))
         shutdown_s, status = node.stop()
         figures |= {"shutdown_s_20k": round(shutdown_s, 2), "fuzz_crashes": int(status != 0) + node.tracebacks()}
         ears.destroy_node()
@@ -177,12 +178,6 @@ def _later(world: GraphWorld, row: int) -> Any:
     closure, told = world.closures[row], world.message(row)
     stamps = (closure.second + 1) * PERIOD_NS, (closure.first + 1) * PERIOD_NS
     return type(told)(*stamps, told.match_T_query, told.covariance)
-
-
-def _memory_mb(process: int) -> float:
-    """Resident memory of a process."""
-    pages = int(Path(f"/proc/{process}/statm").read_text(encoding="utf-8").split()[1])
-    return round(pages * 4096 / 1e6)
 
 
 def _ignore(_: Exception) -> None:

@@ -14,9 +14,10 @@ from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 
 from umf_ros.core.config import Qos
+from umf_ros.core.io import memory_mb
 from umf_ros.nodes import diagnostics
 from umf_ros.nodes.conversions import sensor_qos
-from umf_ros.nodes.diagnostics import InputWatch, memory_mb, status
+from umf_ros.nodes.diagnostics import InputWatch, status
 
 TOPIC = "/watched/image"
 

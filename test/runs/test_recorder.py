@@ -19,10 +19,11 @@ from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import make_pose
+from umf_ros.core.io import memory_mb
 from umf_ros.detector import Detection
 from umf_ros.runs import writer as recorder_module
 from umf_ros.runs.run_file import ALWAYS, SCAN_UNIT_M, RunFile, read_closures, read_descriptors
-from umf_ros.runs.writer import RunRecorder, count_drops, peak_memory_mb, read_summary
+from umf_ros.runs.writer import RunRecorder, count_drops, read_summary
 from umf_ros.sensors.synchronizer import INPUTS, SURPLUS, InputCounter
 from umf_ros.verification import Hypothesis, RejectReason
 
@@ -135,9 +136,9 @@ def test_the_summary_can_be_written_again_as_the_run_goes_on(tmp_path: Path) -> 
 
 def test_the_memory_is_that_of_the_process_and_not_of_the_one_that_started_it() -> None:
     large = np.ones(700 * 2**17)
-    code = "from umf_ros.runs.writer import peak_memory_mb; print(peak_memory_mb())"
+    code = "import umf_ros.runs.writer; from umf_ros.core.io import memory_mb; print(memory_mb(peak=True))"
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert 20 < float(child.stdout) < 600 < large.nbytes / 2**20 < peak_memory_mb()
+    assert 20 < float(child.stdout) < 600 < large.nbytes / 2**20 < memory_mb(peak=True)
 
 
 def test_a_keyframe_that_was_asked_and_found_nothing_is_no_query(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""YAML files, SQLite files, locks and atomic writes."""
+"""YAML files, SQLite files, locks, atomic writes, and the memory of processes."""
 
 from __future__ import annotations
 
@@ -348,3 +348,11 @@ def read_values(path: Path) -> dict[str, Any]:
             raise ConfigError(f"{path}: a name must be text, not {wrong[0]!r}")
         groups += [value for value in group.values() if isinstance(value, dict)]
     return content
+
+
+def memory_mb(process: int | str = "self", peak: bool = False) -> float:
+    """Return the resident memory of a process, or its peak."""
+    # `getrusage` would count that of the process that started it
+    lines = Path(f"/proc/{process}/status").read_text(encoding="utf-8").splitlines()
+    name = "VmHWM:" if peak else "VmRSS:"
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(name))

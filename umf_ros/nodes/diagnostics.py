@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from array import array
 from collections.abc import Mapping
-from pathlib import Path
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -30,12 +28,6 @@ def status(level: bytes, name: str, message: str, values: Mapping[str, object]) 
     texts = {key: f"{value:.6g}" if isinstance(value, float) else str(value) for key, value in values.items()}
     pairs = [KeyValue(key=key, value=text) for key, text in texts.items()]
     return DiagnosticStatus(level=level, name=name, message=message, values=pairs)
-
-
-def memory_mb() -> float:
-    """Return the current resident memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
-    return pages * resource.getpagesize() / 2**20
 
 
 class InputWatch:

@@ -28,11 +28,12 @@ from umf_ros.core.config import FrameIds, Settings, topics_of
 from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line
 from umf_ros.core.frames import Frame, Keyframe, LoopClosure, State
 from umf_ros.core.geometry import Array, rotation_angle
+from umf_ros.core.io import memory_mb
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.nodes import conversions as messages
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, MAX_LINES, SCAN_FIELDS
-from umf_ros.nodes.diagnostics import ERROR, OK, WARN, memory_mb, status
+from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.runs.writer import RunRecorder, count_drops, with_places
 from umf_ros.sensors.calibration import calibration_of

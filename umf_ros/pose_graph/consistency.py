@@ -241,10 +241,10 @@ class NoiseScaleEstimator:
         self._likelihood = self._likelihood + new
         self.loops += len(latest)
         # a loop counts for single axes as far as all together take it for right, by the stated noise at least
-        odometry, closures = np.unravel_index(np.argmax(self._likelihood), self._likelihood.shape)
-        best = max(odometry, len(_GRID) // 2), closures
-        right, wrong = (likelihoods[:, *best] for likelihoods in np.broadcast_arrays(*_likelihoods(spread)))
-        self._of_axis += np.tensordot(expit(right - wrong), _likelihoods_by_axis(spread), axes=1)
+        odometry, closures = divmod(int(np.argmax(self._likelihood)), len(_GRID))
+        right, wrong = _likelihoods(spread)
+        weights = expit(right - wrong)[:, max(odometry, len(_GRID) // 2), closures]
+        self._of_axis += np.tensordot(weights, _likelihoods_by_axis(spread), axes=1)
 
     @property
     def scale(self) -> NoiseScale:
@@ -263,7 +263,7 @@ class NoiseScaleEstimator:
         # the axis that drifts most decides: gravity keeps roll and pitch upright, not the heading
         by_axis = self._of_axis[:, :, column]
         gains = np.maximum.accumulate(by_axis[:, ::-1], axis=1)[:, ::-1] - by_axis  # by a larger factor
-        row += int(np.argmax((gains <= _NATS_PER_FACTOR).all(axis=0)[row:]))
+        row += int(np.argmax(gains.max(axis=0)[row:] <= _NATS_PER_FACTOR))
         odometry_factor, closures_factor = _significant(float(_GRID[row])), _significant(float(_GRID[column]))
         least = _LEAST_ODOMETRY * min(closures_factor, 1.0)
         return NoiseScale(max(odometry_factor, least), closures_factor)

@@ -22,7 +22,7 @@ from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, Keyframe
 from umf_ros.core.geometry import Array, evenly
-from umf_ros.core.io import create_run_folder, write_atomically
+from umf_ros.core.io import create_run_folder, memory_mb, write_atomically
 from umf_ros.runs.run_file import (
     NAME,
     SCAN_UNIT_M,
@@ -187,7 +187,7 @@ class RunRecorder(RunFile):
             "latency_ms": {stage: _percentiles(values) for stage, values in self._latency.items()},
             "drops": dict(drops),
             "realtime_factor": round(self._recorded_ns * 1e-9 / max(elapsed_s, 1e-9), 3),
-            "peak_rss_mb": round(peak_memory_mb(), 1),
+            "peak_rss_mb": round(memory_mb(peak=True), 1),
             "seed": self._settings.verification.seed,
             "version": __version__,
             "weights": self._weights,
@@ -261,12 +261,6 @@ def read_summary(folder: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or "closures_published" not in content:
         raise UmfError(f"{path} is not a summary of a run")
     return content
-
-
-def peak_memory_mb() -> float:
-    """Return the peak resident memory of this process; `getrusage` would count that of the process that started it."""
-    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
 
 
 def _percentiles(values: array[float]) -> dict[str, float | None]:

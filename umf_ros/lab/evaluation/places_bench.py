@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import shutil
 import sqlite3
 import tempfile
@@ -19,6 +18,7 @@ import numpy as np
 
 from umf_ros.core.config import Database, Loop
 from umf_ros.core.frames import Embedding, Keyframe, Points, StereoCamera
+from umf_ros.core.io import memory_mb
 from umf_ros.places.database import PlaceDatabase, PlaceIndex, Rows
 from umf_ros.places.store import pack
 
@@ -128,12 +128,12 @@ def measure_store(path: Path, seed: int) -> StoreFigures:
     """Open a store twice and query it; the first opening writes the file of the index."""
     dimension = _dimension(path)
     _open(path, dimension).close()
-    before = _resident()
+    before = memory_mb()
     wall, cpu = time.perf_counter(), time.process_time()
     places = _open(path, dimension)
     open_s, open_cpu_s = time.perf_counter() - wall, time.process_time() - cpu
     query_ms, query_cpu_ms, recall = _ask(places, np.random.default_rng(seed + 1))
-    used = _resident() - before
+    used = (memory_mb() - before) * 2**20
     disk = sum(file.stat().st_size for file in path.parent.iterdir())
     exact = places.index.is_exact
     places.close()
@@ -194,7 +194,3 @@ def bare_keyframe(
     return Keyframe(
         stamp_ns, Embedding(descriptor), camera, np.eye(4), points, path_length_m=path_length_m, session=session
     )
-
-
-def _resident() -> int:
-    return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
