@@ -41,6 +41,7 @@ _OUTLIERS = 0.5
 _NATS_PER_FACTOR = 5.0
 _FEWEST_LOOPS = 10
 _TOLERANCE = np.log(1.8)
+_SAME_UNITS = np.log(4.0)
 # the first loops are too short to show drift, unless all noise is stated in other units
 _LEAST_ODOMETRY = 0.3
 
@@ -264,9 +265,13 @@ class NoiseScaleEstimator:
         by_axis = self._of_axis[:, :, column]
         gains = np.maximum.accumulate(by_axis[:, ::-1], axis=1)[:, ::-1] - by_axis  # by a larger factor
         row += int(np.argmax(gains.max(axis=0)[row:] <= _NATS_PER_FACTOR))
-        odometry_factor, closures_factor = _significant(float(_GRID[row])), _significant(float(_GRID[column]))
+        odometry_factor, closures_factor = float(_GRID[row]), float(_GRID[column])
+        if one not in (row, column) and abs(np.log(odometry_factor / closures_factor)) < _SAME_UNITS:
+            # a common factor of units is likelier than two errors: the ratio counts, and it is as stated
+            odometry_factor = closures_factor = max(odometry_factor, closures_factor)
+        closures_factor = _significant(closures_factor)
         least = _LEAST_ODOMETRY * min(closures_factor, 1.0)
-        return NoiseScale(max(odometry_factor, least), closures_factor)
+        return NoiseScale(max(_significant(odometry_factor), least), closures_factor)
 
     def _is_widely_better(self, one: tuple[int, int], other: tuple[int, int]) -> bool:
         """Return whether one choice is better even without the place that favours it most."""
