@@ -169,7 +169,7 @@ def _simulate_mini(path: Path) -> None:
 
 @pytest.fixture(scope="session")
 def mini_config(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Settings for the mini bag: its loop closes sooner than a rover's."""
+    """Settings for the mini bag: its loop closes sooner than a rover's, and every third scan is enough."""
     path = tmp_path_factory.mktemp("config") / "mini.yaml"
-    path.write_text("/**: {ros__parameters: {loop: {min_time_gap_s: 8.0, min_travel_m: 15.0}}}\n")
+    path.write_text("/**: {ros__parameters: {loop: {min_time_gap_s: 8.0, min_travel_m: 15.0},\n  keyframe: {min_translation_m: 1.5, min_rotation_deg: 60.0}}}\n")
     return path

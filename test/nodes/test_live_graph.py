@@ -39,10 +39,18 @@ class LiveRun:
 
 
 @pytest.fixture(scope="module")
-def live(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRun]:
+def dense_config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Settings for the mini bag with every scan, of which the ground is made."""
+    path = tmp_path_factory.mktemp("config") / "dense.yaml"
+    path.write_text("/**: {ros__parameters: {loop: {min_time_gap_s: 8.0, min_travel_m: 15.0}}}\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def live(mini_bag: Path, dense_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRun]:
     """Play the mini bag once, at half speed: what is compared is what was found, not how fast."""
     folder = tmp_path_factory.mktemp("live")
-    common = ["--ros-args", "--params-file", str(mini_config), "-p", f"results_dir:={folder}", *QOS]
+    common = ["--ros-args", "--params-file", str(dense_config), "-p", f"results_dir:={folder}", *QOS]
     # the front-end finds its topics; the player does not wait for a back-end that is still searching
     odometry = ["-p", "topics.odometry:=/odom"]
     named = {"loop_closure_node": [], "pose_graph_node": odometry, "map_node": odometry}
@@ -71,9 +79,9 @@ def live(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFac
 
 
 @pytest.fixture(scope="module")
-def offline(mini_bag: Path, mini_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def offline(mini_bag: Path, dense_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("offline")
-    settings = load_settings(mini_config)
+    settings = load_settings(dense_config)
     replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
     for _ in replay.run(FrameReader(open_bag(mini_bag), settings).stream()):
         pass
