@@ -171,5 +171,6 @@ def _simulate_mini(path: Path) -> None:
 def mini_config(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Settings for the mini bag: its loop closes sooner than a rover's, and every third scan is enough."""
     path = tmp_path_factory.mktemp("config") / "mini.yaml"
-    path.write_text("/**: {ros__parameters: {loop: {min_time_gap_s: 8.0, min_travel_m: 15.0},\n  keyframe: {min_translation_m: 1.5, min_rotation_deg: 60.0}}}\n")
+    loop, keyframe = "{min_time_gap_s: 8.0, min_travel_m: 15.0}", "{min_translation_m: 1.5, min_rotation_deg: 60.0}"
+    path.write_text(f"/**: {{ros__parameters: {{loop: {loop}, keyframe: {keyframe}}}}}\n")
     return path
