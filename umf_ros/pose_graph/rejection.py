@@ -189,7 +189,7 @@ class OutlierRejection:
         """Decide about closures and solve the map with the accepted ones; return false without any."""
         rows = sorted(rows)
         agreed = self._gate(rows)
-        supported = [member for found in self._supported_sets(rows, State.PENDING) for member in found]
+        supported = [member for found in self._supported_sets(rows, self._of(State.PENDING)) for member in found]
         supported += self._overrule(rows)
         reasons = dict.fromkeys(supported, ClosureReason.SUPPORTED) | dict.fromkeys(agreed, ClosureReason.AGREES)
         # only without other accepted closures: the map moved by those may contradict these
@@ -268,9 +268,9 @@ class OutlierRejection:
         chosen = self.closures[rows]
         return invert(self._sessions.at(chosen["match"]) @ chosen["pose"]) @ self._sessions.at(chosen["query"])
 
-    def _supported_sets(self, rows: Iterable[int], state: State) -> list[list[int]]:
-        """Consistency sets among the closures of one state, each with one of `rows`, that no chance explains."""
-        members = self._of(state) & ~self._revoked & ~self._of(ClosureReason.TOO_FAR)
+    def _supported_sets(self, rows: Iterable[int], members: NDArray[np.bool_]) -> list[list[int]]:
+        """Consistency sets among `members`, each with one of `rows`, that no chance explains."""
+        members = members & ~self._revoked & ~self._of(ClosureReason.TOO_FAR)
         sets: list[list[int]] = []
         for row in rows:
             if members[row] and not any(row in found for found in sets):
@@ -284,7 +284,7 @@ class OutlierRejection:
     def _overrule(self, rows: Iterable[int]) -> list[int]:
         """Revoke accepted closures for a set that the map contradicts, of more places than those; returns the set."""
         accepted, by_hand = self._of(State.ACCEPTED), self._of(ClosureReason.ACCEPTED_BY_HAND)
-        for found in self._supported_sets(rows, State.REJECTED):
+        for found in self._supported_sets(rows, ~accepted):
             losers = sorted({loser for row in found for loser in self._consistency.opponents(row, accepted)})
             if by_hand[losers].any():
                 continue
