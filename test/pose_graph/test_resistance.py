@@ -72,6 +72,12 @@ def test_odometry_stated_too_uncertain_makes_no_room_for_aliases(seed: int) -> N
     assert accepted(graph) == right(world)
 
 
+@pytest.mark.parametrize("stated", [1 / 3, 3.0])
+def test_a_group_of_aliases_is_not_accepted_because_nothing_contradicts_it(stated: float) -> None:
+    world = with_wrong_closures(garage(500, 25501), 0.5, "near", 1)
+    assert accepted(drive(world, stated=stated)) == right(world)
+
+
 def test_a_few_lucky_loops_do_not_make_odometry_better_than_stated() -> None:
     world = with_wrong_closures(rover_loops(400, 10176), 0.5, "near", 1)
     graph = drive(world)

@@ -284,10 +284,7 @@ def _significant(factor: float) -> float:
 
 
 def _likelihoods(loops: Loops) -> tuple[Array, Array]:
-    """Return log-likelihoods of N loops with right closures over the grids, (N, G, G), and with a wrong one, (N, 1, 1).
-
-    The grids are those of odometry and closure factors.
-    """
+    """Return log-likelihoods of N loops over the grids: (N, G, G) of right closures, (N, 1, 1) with a wrong one."""
     # whiten by the closures' noise, then turn the odometry's to its axes: both become diagonal
     lower = np.linalg.cholesky(loops["closures"])
     white = np.linalg.solve(lower, np.swapaxes(np.linalg.solve(lower, loops["odometry"]), -1, -2))
