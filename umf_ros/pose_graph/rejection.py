@@ -40,8 +40,8 @@ _LOOPS_PER_CLOSURE = 3
 _MOST_ROUNDS = 4
 # a rejected closure further than this from the moved map (m) is not compared again
 _CLOSE_M = 2.0
-# largest odds against a closure without support: during the drive, and at the end; .1 during the drive accepts a group of
-# aliases in 2 of 42 cells of `pose_graph.py` with seed 25501, .03 none, and both accept all right closures
+# largest odds against a closure without support: during the drive, and at the end; .1 during the drive accepts a group
+# of aliases in 2 of 42 cells of `pose_graph.py` with seed 25501, .03 none, and both accept all right closures
 _MOST_ODDS, _MOST_ODDS_AT_LAST = 0.03, 0.2
 # prior: one of five closures is wrong
 _WRONG_BEFORE, _RIGHT_BEFORE = 1, 4
