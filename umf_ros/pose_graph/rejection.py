@@ -283,7 +283,7 @@ class OutlierRejection:
         return sets
 
     def _overrule(self, rows: Iterable[int]) -> list[int]:
-        """Revoke accepted closures for a set that the map contradicts, of more places than those; returns the set."""
+        """Revoke accepted closures for a supported set of others, of more places than those; returns the set."""
         accepted, by_hand = self._of(State.ACCEPTED), self._of(ClosureReason.ACCEPTED_BY_HAND)
         for found in self._supported_sets(rows, ~accepted):
             losers = sorted({loser for row in found for loser in self._consistency.opponents(row, accepted)})
