@@ -52,6 +52,7 @@ GOOD_VIEWS = {
     "pose_inliers": 60.0,
     "spread": 0.3,
     "disparity_bias_px": 0.1,
+    "disparity_bias_std_px": 0.7,
     "two_way_m": 0.1,
     "position_std_m": 0.03,
     "heading_std_deg": 0.15,

@@ -230,11 +230,21 @@ def test_the_keyframes_of_the_helper_start_where_they_say() -> None:
 
 
 @pytest.mark.parametrize(
-    ("bias_px", "words"), [(0.8, "0.8 px too little disparity"), (-0.6, "0.6 px too much"), (0.1, "")]
+    ("biases_px", "std_px", "words"),
+    [
+        ([0.8] * 6, 0.1, "0.8 px too little disparity"),
+        ([-0.6] * 6, 0.1, "0.6 px too much"),
+        ([0.1] * 6, 0.01, ""),
+        # a single pair does not know it, thirty do
+        ([0.6] * 6, 1.0, ""),
+        ([1.6, -0.4] * 15, 1.0, "0.6 px too little disparity"),
+        # they disagree by more than they say
+        ([3.6, -2.4] * 15, 0.1, ""),
+    ],
 )
-def test_a_bias_of_the_disparities_is_told(tmp_path: Path, bias_px: float, words: str) -> None:
-    numbers = {"pose_inliers": 40.0, "disparity_bias_px": bias_px, "probability": 0.97}
-    tested = [candidate(50 + n, 10 + n, None, **numbers) for n in range(6)]
-    closures = [closure(50 + n, 10 + n) for n in range(6)]
+def test_a_bias_of_the_disparities_is_told(tmp_path: Path, biases_px: list[float], std_px: float, words: str) -> None:
+    known = {"pose_inliers": 40.0, "disparity_bias_std_px": std_px, "probability": 0.97}
+    tested = [candidate(50 + n, 10 + n, None, **known, disparity_bias_px=px) for n, px in enumerate(biases_px)]
+    closures = [closure(50 + n, 10 + n) for n in range(len(biases_px))]
     told = " ".join(one.what for one in look_first(examined(tmp_path, closures, tested)))
     assert ("disparity" in told) == bool(words) and words in told

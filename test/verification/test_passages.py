@@ -14,7 +14,7 @@ from umf_ros.core.frames import Candidate, Embedding, Keyframe
 from umf_ros.core.geometry import Array, make_pose
 from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA
 from umf_ros.submaps.history import submap_around
-from umf_ros.verification import Hypothesis, RejectReason, Verifier
+from umf_ros.verification import Hypothesis, RejectReason, Verifier, verifier
 from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import known_only
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
@@ -203,6 +203,23 @@ def test_a_pose_that_fits_as_well_elsewhere_along_a_passage_becomes_no_closure(n
     verdict = verdict_of(*PAIRS[name], np.eye(4))
     assert verdict.reason in (RejectReason.PASSAGE, RejectReason.IMPROBABLE) and verdict.closure is None
     assert verdict.measurements["lead"] < 1.0
+
+
+def test_hypotheses_along_one_passage_are_compared_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first was compared with all positions of the others; the other heading is another hypothesis."""
+    begun: list[Array] = []
+    monkeypatch.setattr(verifier, "locate_along", lambda *it: begun.append(it[2]) or locate_along(*it))
+    verdict = verdict_of(*PAIRS["corridor"], np.eye(4))
+    assert 1 <= len(begun) <= 2 and verdict.measurements["lead"] < 1.0
+    assert len({bool(pose[0, 0] > 0) for pose in begun}) == len(begun)
+
+
+def test_only_the_position_along_a_passage_may_differ_of_what_was_compared() -> None:
+    found = locate_along(*PAIRS["corridor"], np.eye(4))
+    assert found is not None
+    along, across, turned = shift(6.0), shift(0.0), shift(0.0)
+    across[1, 3], turned[:3, :3] = 1.5, np.diag([-1.0, -1.0, 1.0])
+    assert found.compared(along) and not found.compared(across) and not found.compared(turned)
 
 
 def test_in_a_passage_the_measurements_are_those_of_the_pose_that_was_taken() -> None:

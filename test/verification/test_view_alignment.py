@@ -125,6 +125,14 @@ def test_a_bias_of_the_disparities_is_estimated_and_the_pose_stays_right(pixels:
     assert error @ np.linalg.solve(covariance, error) < 16  # 99.9 % of a chi-square of three
 
 
+def test_a_bias_is_measured_as_well_as_it_says_and_not_from_one_place() -> None:
+    biased = with_bias(QUERY, -0.8), with_bias(MATCH, -0.8)
+    moved, still = aligned(views(*biased)), views(biased[0], biased[0]).align(np.eye(4))
+    bias_px, std_px = moved.measured_bias_px
+    assert abs(bias_px - 0.8) < 4 * std_px and abs(bias_px) > abs(moved.bias_px)
+    assert still.measured_bias_px[1] > 5 * std_px
+
+
 def test_covariance_is_honest_over_many_pairs() -> None:
     """Squared errors by their own information are about six in the mean, as six numbers of it are."""
     squared = []

@@ -55,7 +55,8 @@ MEASUREMENTS = {
     "pose_inliers": "feature pairs that agree with the pose",
     "residual_sigmas": "errors of reprojection in standard deviations of the features' noise",
     "spread": "of the pairs across the image: smaller deviation of column and row, as a share of width and height",
-    "disparity_bias_px": "estimated bias of all disparities; positive where stereo measures too little",
+    "disparity_bias_px": "bias of all disparities by these views alone; positive where stereo measures too little",
+    "disparity_bias_std_px": "its standard deviation, large where both views are from one place",
     "two_way_m": "distance of the poses that the query's depths and the match's give by themselves",
     "position_std_m": "standard deviation of the position along its least known direction, from the residuals",
     "heading_std_deg": "of the heading",
@@ -125,12 +126,14 @@ def _measure_scans(alignment: Alignment, match: PreparedScan, query: PreparedSca
 
 
 def _measure_views(alignment: ViewAlignment) -> dict[str, float]:
+    bias_px, bias_std_px = alignment.measured_bias_px
     return {
         "residual_m": alignment.distance_m,
         "residual_sigmas": alignment.spread_sigmas,
         "overlap": alignment.share,
         "pose_inliers": float(len(alignment.residuals)),
         "spread": alignment.spread,
-        "disparity_bias_px": alignment.bias_px,
+        "disparity_bias_px": bias_px,
+        "disparity_bias_std_px": bias_std_px,
         "two_way_m": alignment.two_way_m,
     }

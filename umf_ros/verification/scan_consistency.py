@@ -212,13 +212,20 @@ Misfits = tuple[Array, NDArray[np.bool_]]
 
 
 class PassagePosition(NamedTuple):
-    """The pose `match_T_query` (4, 4) at which two scans in a passage fit best.
+    """The pose `match_T_query` (4, 4) at which two scans in a passage fit best, and its direction (3,) there.
 
     The lead is how much worse they fit elsewhere along the passage, as a share of what a closure needs.
     """
 
     pose: Array
     lead: float
+    way: Array
+
+    def compared(self, pose: Array) -> bool:
+        """Whether a pose, up to its position along the passage, is this one: it was compared with it."""
+        moved = pose.copy()
+        moved[:3, 3] += (self.pose[:3, 3] - pose[:3, 3]) @ self.way * self.way
+        return near(moved, self.pose, const.DISTINCT_M, const.DISTINCT_RAD)
 
 
 def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> PassagePosition | None:
@@ -262,7 +269,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     sigmas = sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9)
     needed = const.PATTERN_SIGMAS if _near_identity(poses[first]) else const.PASSAGE_SIGMAS
     ratios = (means[elsewhere] - means[first]) / const.PASSAGE_LEAD
-    return PassagePosition(poses[first], float(np.minimum(ratios, sigmas / needed).min()))
+    return PassagePosition(poses[first], float(np.minimum(ratios, sigmas / needed).min()), way)
 
 
 def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Misfits:

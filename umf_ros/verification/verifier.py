@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from umf_ros.core.config import Verification
-from umf_ros.core.frames import Keyframe, LoopClosure
+from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
@@ -25,7 +25,7 @@ from umf_ros.verification.pose_search import (
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans, inspect
-from umf_ros.verification.scan_consistency import ambiguity, locate_along, repetition
+from umf_ros.verification.scan_consistency import PassagePosition, ambiguity, locate_along, repetition
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 
@@ -146,21 +146,27 @@ class Verifier:
         """Align and measure the first hypotheses, and judge each beside the others about its candidate.
 
         The others are only aligned where one of these is promising: the right pose may be among them. The slow tests
-        are left out where they cannot change the decision.
+        are left out where they cannot change the decision; of the hypotheses along one passage, the first stands for
+        all.
         """
         aligned = self._aligned(hypotheses[: const.MAX_REFINED], [])
         promising = [one.candidate for one in aligned if self._promises(one, least)]
         others = [one for one in hypotheses[const.MAX_REFINED :] if any(one.candidate is it for it in promising)]
         aligned += self._aligned(others, aligned)
+        judged: list[Hypothesis] = []
+        passages: list[tuple[Candidate, PassagePosition]] = []
         for one in aligned:
+            if any(one.candidate is candidate and found.compared(one.pose) for candidate, found in passages):
+                continue
+            judged.append(one)
             one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
-            if self._promises(one, least):
-                self._look_elsewhere(one)
+            if self._promises(one, least) and (found := self._look_elsewhere(one)):
+                passages.append((one.candidate, found))
             one.probability = self._probability(one)
             if "rival_far" in one.measurements and self._objection(one) is None:
                 theirs, ours = one.scans
                 one.measurements |= known_only({"repetition": repetition(theirs, ours, one.pose)})
-        return aligned
+        return judged
 
     def _promises(self, hypothesis: Hypothesis, least: float) -> bool:
         """Whether a hypothesis of scans can be so probable."""
@@ -172,17 +178,18 @@ class Verifier:
         of_pose = measure(hypothesis) | {"support": self._memory.support(query, match, hypothesis.pose)}
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
-    def _look_elsewhere(self, hypothesis: Hypothesis) -> None:
-        """Compare with other poses; of scans in a passage, move to the best position along it."""
+    def _look_elsewhere(self, hypothesis: Hypothesis) -> PassagePosition | None:
+        """Compare with other poses; of scans in a passage, move to the best position along it, and return it."""
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
         found = locate_along(theirs, ours, hypothesis.pose)
         if found is None:
             hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
-            return
+            return None
         hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
         self._measure(hypothesis)
         hypothesis.measurements["lead"] = found.lead
+        return found
 
     def _probability(self, hypothesis: Hypothesis) -> float:
         """That a hypothesis is right; where scans show bare ground alone, nothing would refute a texture seen twice."""

@@ -10,6 +10,7 @@ leave it open, it widens the covariance.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -118,6 +119,7 @@ class ViewAlignment:
         jacobian: (P, 3, 7) of the residuals by (x y z rx ry rz) about the match axes at the query's origin, and by the
             bias of all disparities in its prior standard deviations.
         bias_px: estimated bias of all disparities, pixels; positive where stereo measures too little.
+        bias_prior_px: its standard deviation before the views are compared.
         spread: how wide the features lie across the match's image: the smaller deviation of both directions, as a
             share of its width and height.
         distance_m: median distance of the two points of a pair, where both depths are known; NaN without any.
@@ -129,6 +131,7 @@ class ViewAlignment:
     residuals: Array
     jacobian: Array
     bias_px: float
+    bias_prior_px: float
     spread: float
     distance_m: float
     share: float
@@ -139,10 +142,28 @@ class ViewAlignment:
         """Information (6, 6) of the residuals as if they were independent, whatever the bias of the disparities."""
         if not len(self.residuals):
             return np.zeros((6, 6))
-        whole = np.einsum("n,nki,nkj->ij", _weight(self.residuals), self.jacobian, self.jacobian)
-        whole = whole / self.spread_sigmas**2
+        whole = self._normal
         found: Array = whole[:6, :6] - np.outer(whole[:6, 6], whole[6, :6]) / (whole[6, 6] + 1.0)
         return found
+
+    @property
+    def measured_bias_px(self) -> tuple[float, float]:
+        """Bias of all disparities by these features alone, without its prior, and its standard deviation, pixels.
+
+        From one place and direction a bias looks the same in both views, and its standard deviation is large.
+        """
+        whole = self._normal
+        known = whole[6, 6] - whole[6, :6] @ np.linalg.lstsq(whole[:6, :6], whole[:6, 6], rcond=None)[0]
+        if not known > 0:
+            return 0.0, float("inf")
+        by_features = known * self.spread_sigmas**2  # as the estimate weighs them against the prior
+        return self.bias_px * (1.0 + 1.0 / by_features), self.bias_prior_px / math.sqrt(known)
+
+    @property
+    def _normal(self) -> Array:
+        """(7, 7) normal matrix of the residuals, by their actual size."""
+        whole = np.einsum("n,nki,nkj->ij", _weight(self.residuals), self.jacobian, self.jacobian)
+        return np.asarray(whole / self.spread_sigmas**2)
 
     @property
     def spread_sigmas(self) -> float:
@@ -211,6 +232,7 @@ class PairedViews:
             pose = make_pose(turn @ pose[:3, :3], pose[:3, 3] + step[:3])
         fit = self._compare(pose)
         bias = _solve(fit)[1]
+        prior_px = const.DISPARITY_BIAS * self.match.camera.width
         fit = fit.without_bias(bias)
         agree = fit.agreeing
         both = agree & self.query.lifted & self.match.lifted
@@ -219,7 +241,8 @@ class PairedViews:
             pose,
             fit.residuals[agree],
             fit.jacobian[agree],
-            bias * const.DISPARITY_BIAS * self.match.camera.width,
+            bias * prior_px,
+            prior_px,
             self._spread(agree),
             float(np.median(np.linalg.norm(gaps, axis=1))) if len(gaps) else float("nan"),
             float(agree.sum()) / max(int((self.query.lifted | self.match.lifted).sum()), 1),
