@@ -189,6 +189,14 @@ def test_a_passage_is_found_in_its_direction_and_a_room_is_none() -> None:
     assert locate_along(match, query, turn) is not None  # a wrong heading hides no passage
 
 
+@pytest.mark.parametrize("x", [0.0, 1.5, -3.0, 5.0])
+def test_cupboards_on_one_side_do_not_turn_the_direction_of_a_passage(x: float) -> None:
+    """Half a degree is a tenth of a metre at the end of the search, where a rival would be missed."""
+    way = passage_direction(corridor(x, 1, UNEVEN, 0.3))
+    assert way is not None
+    assert abs(np.degrees(np.arctan(way[1] / way[0]))) < 0.12
+
+
 def verdict_of(match: PreparedScan, query: PreparedScan, guess: Array) -> Hypothesis:
     """The verdict about a pair of scans that odometry expects at a pose."""
     ours, theirs = (

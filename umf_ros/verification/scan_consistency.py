@@ -260,7 +260,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     misfits, known = _misfits(match, query, poses)
     means = _means(misfits, known)
     first = int(np.argmin(means[: 1 + len(aligned)]))
-    elsewhere = np.abs((poses[:, :3, 3] - poses[first, :3, 3]) @ way) > 2 * np.ptp(const.PASSAGE_SHIFTS_M[:2])
+    elsewhere = np.abs((poses[:, :3, 3] - poses[first, :3, 3]) @ way) > const.PASSAGE_BESIDE_M
     both = known[elsewhere] & known[first]
     worse = np.where(both, misfits[elsewhere] - misfits[first], 0.0)
     points = [transform(poses[first], half) for half in _halves(query)] + _halves(match)
@@ -317,22 +317,31 @@ def passage_direction(scan: PreparedScan) -> Array | None:
 
     A place is a passage where surfaces across it outweigh those along it.
     """
-    weights, _ = _across(scan, scan.normals[scan.picks])
-    if weights[0] > const.PASSAGE_RATIO * weights[1]:  # most places are none: their planes are never asked for
+    sums, _ = _across(scan, scan.normals[scan.picks])
+    if sums[0] > const.PASSAGE_RATIO * sums[1]:  # most places are none: their planes are never asked for
         return None
     flat = np.concatenate([planes.normals[planes.planar] for planes in scan.surfaces])
     if len(flat) < const.PASSAGE_SURFACE * len(scan.points):
         return None
-    _, ways = _across(scan, flat)
-    way: Array = scan.up.T @ np.append(ways[:, 0], 0.0)
+    # door frames, windows and goods show sides along the passage, and not evenly: walls alone tell its direction
+    way = _across(scan, flat)[1]
+    for spread in const.WALL_RAD:
+        way = _across(scan, flat, 1.0 / (1.0 + (flat @ way / spread) ** 2))[1]
     return way
 
 
-def _across(scan: PreparedScan, normals: Array) -> tuple[Array, Array]:
-    """Weights (2,) and horizontal directions (2, 2) of normals (N, 3) of a scan, the least first."""
+def _across(scan: PreparedScan, normals: Array, weights: Array | float = 1.0) -> tuple[Array, Array]:
+    """Sums (2,) of squared normals along two horizontal directions, the least first, and this direction (3,).
+
+    Args:
+        scan: has the normals.
+        normals: (N, 3) unit vectors.
+        weights: (N,) of the normals.
+    """
     level = (normals @ scan.up.T)[:, :2]
-    weights, ways = np.linalg.eigh(level.T @ level)
-    return weights, ways
+    sums, ways = np.linalg.eigh((level.T * weights**2) @ level)
+    way: Array = scan.up.T @ np.append(ways[:, 0], 0.0)
+    return sums, way
 
 
 def _halves(scan: PreparedScan, every: int = 1) -> list[Array]:
