@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 from measurements import GOOD
+from scipy.spatial.transform import Rotation
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Embedding, Keyframe
 from umf_ros.core.geometry import Array, make_pose
+from umf_ros.lab.simulation.domains.passages import PASSAGES, drive
 from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA
 from umf_ros.submaps.history import submap_around
 from umf_ros.verification import Hypothesis, RejectReason, Verifier, verifier
@@ -19,7 +22,13 @@ from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import known_only
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import align_scans
-from umf_ros.verification.scan_consistency import ambiguity, compare_scans, locate_along, passage_direction
+from umf_ros.verification.scan_consistency import (
+    PassagePosition,
+    ambiguity,
+    compare_scans,
+    locate_along,
+    passage_direction,
+)
 
 ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
 AZIMUTHS = np.radians(np.arange(0.0, 360.0, 0.4))
@@ -197,6 +206,16 @@ def test_cupboards_on_one_side_do_not_turn_the_direction_of_a_passage(x: float) 
     assert abs(np.degrees(np.arctan(way[1] / way[0]))) < 0.12
 
 
+def test_floor_and_ceiling_tell_the_slope_of_a_passage_where_levelling_errs() -> None:
+    hallway = next(one for one in PASSAGES if one.name == "hallway-spin32-cart-relief")
+    for seen in drive(hallway, 10005)[:3]:
+        around = PreparedScan(thin_scan(seen.sweep.points))
+        around.up = around.up @ Rotation.from_euler("y", 3.0, degrees=True).as_matrix()
+        way = passage_direction(around)
+        assert way is not None
+        assert np.degrees(np.arccos(abs(way @ seen.world_T_lidar[0, :3]))) < 0.6
+
+
 def verdict_of(match: PreparedScan, query: PreparedScan, guess: Array) -> Hypothesis:
     """The verdict about a pair of scans that odometry expects at a pose."""
     ours, theirs = (
@@ -220,6 +239,23 @@ def test_hypotheses_along_one_passage_are_compared_once(monkeypatch: pytest.Monk
     verdict = verdict_of(*PAIRS["corridor"], np.eye(4))
     assert 1 <= len(begun) <= 2 and verdict.measurements["lead"] < 1.0
     assert len({bool(pose[0, 0] > 0) for pose in begun}) == len(begun)
+
+
+def test_the_other_heading_is_a_rival_too() -> None:
+    way = np.array([1.0, 0.0, 0.0])
+    good, worse, bad = (PassagePosition(np.eye(4), 2.0, math.log(misfit), way) for misfit in (0.2, 0.21, 0.3))
+    assert good.lead_over([]) == good.lead_over([bad]) == 2.0
+    assert 0 < good.lead_over([bad, worse]) < 1.0 and bad.lead_over([good]) < 0
+
+
+def test_a_passage_that_fits_as_well_turned_round_gives_no_closure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def located(*given: Any) -> PassagePosition | None:
+        found = locate_along(*given)
+        return found and found._replace(lead=2.0, misfit=-1.0)
+
+    monkeypatch.setattr(verifier, "locate_along", located)
+    verdict = verdict_of(*PAIRS["corridor"], np.eye(4))
+    assert verdict.closure is None and verdict.measurements["lead"] == 0.0
 
 
 def test_only_the_position_along_a_passage_may_differ_of_what_was_compared() -> None:

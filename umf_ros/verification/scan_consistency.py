@@ -12,6 +12,7 @@ taken at different places are compared. Where next to nothing stands, positions 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -214,12 +215,18 @@ Misfits = tuple[Array, NDArray[np.bool_]]
 class PassagePosition(NamedTuple):
     """The pose `match_T_query` (4, 4) at which two scans in a passage fit best, and its direction (3,) there.
 
-    The lead is how much worse they fit elsewhere along the passage, as a share of what a closure needs.
+    The lead is how much worse they fit elsewhere along the passage, as a share of what a closure needs; the misfit the
+    logarithm of the mean.
     """
 
     pose: Array
     lead: float
+    misfit: float
     way: Array
+
+    def lead_over(self, others: Iterable[PassagePosition]) -> float:
+        """The lead, also over the positions of the same scans turned round."""
+        return min([self.lead, *((other.misfit - self.misfit) / const.PASSAGE_LEAD for other in others)])
 
     def compared(self, pose: Array) -> bool:
         """Whether a pose, up to its position along the passage, is this one: it was compared with it."""
@@ -233,8 +240,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
 
     Poses as far along as scans overlap are compared by some of the points, and the best are aligned. The best of these
     leads another when the misfit of the other is larger, and larger at enough places along the passage: at one place,
-    a door that moved or a person explains it. Near the identity more is asked, for what is left of the pattern's
-    influence is there.
+    a door that moved or a person explains it.
 
     Args:
         match: the matched scan.
@@ -261,15 +267,18 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     means = _means(misfits, known)
     first = int(np.argmin(means[: 1 + len(aligned)]))
     elsewhere = np.abs((poses[:, :3, 3] - poses[first, :3, 3]) @ way) > const.PASSAGE_BESIDE_M
+    elsewhere &= means < 0.0  # of the others too few points are known
+    if not elsewhere.any():
+        return PassagePosition(poses[first], 0.0, means[first], way)
     both = known[elsewhere] & known[first]
     worse = np.where(both, misfits[elsewhere] - misfits[first], 0.0)
     points = [transform(poses[first], half) for half in _halves(query)] + _halves(match)
     metre = np.floor(np.concatenate(points) @ way).astype(int)
     sums = np.stack([np.bincount(metre - metre.min(), row) for row in worse])
     sigmas = sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9)
-    needed = const.PATTERN_SIGMAS if _near_identity(poses[first]) else const.PASSAGE_SIGMAS
     ratios = (means[elsewhere] - means[first]) / const.PASSAGE_LEAD
-    return PassagePosition(poses[first], float(np.minimum(ratios, sigmas / needed).min()), way)
+    lead = float(np.minimum(ratios, sigmas / const.PASSAGE_SIGMAS).min())
+    return PassagePosition(poses[first], lead, means[first], way)
 
 
 def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Misfits:
@@ -304,16 +313,16 @@ def _means(misfits: Array, known: NDArray[np.bool_]) -> Array:
 
 
 def _peaks(means: Array) -> list[int]:
-    """The best of the shifts along a passage, apart from each other, by their mean misfits."""
+    """The best of the shifts along a passage, a metre and more apart from each other, by their mean misfits."""
     picks: list[int] = []
     for number in np.argsort(means).tolist():
-        if len(picks) < const.PASSAGE_RIVALS and all(abs(number - other) > 1 for other in picks):
+        if len(picks) < const.PASSAGE_RIVALS and all(abs(number - other) >= const.PASSAGE_APART for other in picks):
             picks.append(number)
     return picks
 
 
 def passage_direction(scan: PreparedScan) -> Array | None:
-    """(3,) the horizontal direction of the passage that a scan was taken in; None where it shows none.
+    """(3,) the direction of the passage that a scan was taken in; None where it shows none.
 
     A place is a passage where surfaces across it outweigh those along it.
     """
@@ -323,23 +332,19 @@ def passage_direction(scan: PreparedScan) -> Array | None:
     flat = np.concatenate([planes.normals[planes.planar] for planes in scan.surfaces])
     if len(flat) < const.PASSAGE_SURFACE * len(scan.points):
         return None
-    # door frames, windows and goods show sides along the passage, and not evenly: walls alone tell its direction
-    way = _across(scan, flat)[1]
+    # door frames, windows and goods show sides along the passage, and not evenly: walls and floor tell its direction
+    way, up = _across(scan, flat)[1], scan.up[2]
     for spread in const.WALL_RAD:
-        way = _across(scan, flat, 1.0 / (1.0 + (flat @ way / spread) ** 2))[1]
+        weights = 1.0 / (1.0 + (flat @ way / spread) ** 2) ** 2
+        level = const.LEVEL_WEIGHT * weights.sum() * np.outer(up, up)  # where no floor is seen, it is level
+        way = np.linalg.eigh((flat.T * weights) @ flat + level)[1][:, 0]
     return way
 
 
-def _across(scan: PreparedScan, normals: Array, weights: Array | float = 1.0) -> tuple[Array, Array]:
-    """Sums (2,) of squared normals along two horizontal directions, the least first, and this direction (3,).
-
-    Args:
-        scan: has the normals.
-        normals: (N, 3) unit vectors.
-        weights: (N,) of the normals.
-    """
+def _across(scan: PreparedScan, normals: Array) -> tuple[Array, Array]:
+    """Sums (2,) of squared normals (N, 3) along two horizontal directions, the least first, and this direction (3,)."""
     level = (normals @ scan.up.T)[:, :2]
-    sums, ways = np.linalg.eigh((level.T * weights**2) @ level)
+    sums, ways = np.linalg.eigh(level.T @ level)
     way: Array = scan.up.T @ np.append(ways[:, 0], 0.0)
     return sums, way
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from umf_ros.core.config import Verification
-from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
+from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
@@ -154,18 +154,21 @@ class Verifier:
         others = [one for one in hypotheses[const.MAX_REFINED :] if any(one.candidate is it for it in promising)]
         aligned += self._aligned(others, aligned)
         judged: list[Hypothesis] = []
-        passages: list[tuple[Candidate, PassagePosition]] = []
+        passages: list[tuple[Hypothesis, PassagePosition]] = []
         for one in aligned:
-            if any(one.candidate is candidate and found.compared(one.pose) for candidate, found in passages):
+            if any(one.candidate is other.candidate and found.compared(one.pose) for other, found in passages):
                 continue
             judged.append(one)
             one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
             if self._promises(one, least) and (found := self._look_elsewhere(one)):
-                passages.append((one.candidate, found))
+                passages.append((one, found))
             one.probability = self._probability(one)
             if "rival_far" in one.measurements and self._objection(one) is None:
                 theirs, ours = one.scans
                 one.measurements |= known_only({"repetition": repetition(theirs, ours, one.pose)})
+        for one, found in passages:
+            turned = [its for other, its in passages if other is not one and other.candidate is one.candidate]
+            one.measurements["lead"] = found.lead_over(turned)
         return judged
 
     def _promises(self, hypothesis: Hypothesis, least: float) -> bool:
@@ -188,7 +191,6 @@ class Verifier:
             return None
         hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
         self._measure(hypothesis)
-        hypothesis.measurements["lead"] = found.lead
         return found
 
     def _probability(self, hypothesis: Hypothesis) -> float:
