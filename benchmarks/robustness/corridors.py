@@ -1,6 +1,6 @@
 """Verification in long narrow passages: corridors, hospital hallways, tunnels, hangar aisles and street canyons.
 
-python benchmarks/robustness/corridors.py [--seed N] [--worlds N] [--jobs N] [--only NAME] [--json FILE]
+python benchmarks/robustness/corridors.py [--seed N] [--worlds N] [--every N] [--jobs N] [--only NAME] [--json FILE]
 
 In every passage 25 scans are taken 0.6 m apart, by turns of two visits; all 600 ordered pairs are verified, LiDAR alone
 and each on its own. A closure is wrong when it is more than 1 m or 5 deg off, and precise below 0.3 m. Most passages
@@ -35,6 +35,7 @@ PRECISE_M = 0.3
 def main(
     seed: Annotated[int, typer.Option(help="of the first passage; 10000 to 19999 are for development")] = TEST.start,
     worlds: Annotated[int, typer.Option(help="passages of each kind, sensor, mount and relief", min=1)] = 1,
+    every: Annotated[int, typer.Option(help="verify every n-th pair only", min=1)] = 1,
     jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1,
     only: Annotated[str, typer.Option(help="passages whose name contains this")] = "",
     json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
@@ -47,7 +48,7 @@ def main(
     latency: list[float] = []
     # a thread pool of Open3D or torch does not survive a fork
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        waiting = [pool.submit(run, passage, seed + world) for passage in chosen for world in range(worlds)]
+        waiting = [pool.submit(run, passage, seed + world, every) for passage in chosen for world in range(worlds)]
         for done in as_completed(waiting):
             name, counts, refine_ms = done.result()
             total += counts
@@ -65,12 +66,13 @@ def main(
         json_file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def run(passage: Passage, seed: int) -> tuple[str, Counter[str], list[float]]:
-    """Name, counts of verdicts and milliseconds of refinement of the pairs of one passage."""
+def run(passage: Passage, seed: int, every: int) -> tuple[str, Counter[str], list[float]]:
+    """Name, counts of verdicts and milliseconds of refinement of every n-th pair of one passage."""
     embedder = make_embedder(EmbeddingSettings(threads=1))
     places = passage_places(passage, seed, embedder)
     verifier, counts, refine_ms = Verifier(Verification()), Counter[str](), []
-    for pair in (ScanPair(query, match, SAME) for query in places for match in places if query is not match):
+    pairs = [ScanPair(query, match, SAME) for query in places for match in places if query is not match]
+    for pair in pairs[::every]:
         verifier.reset()
         candidate = Candidate(0, pair.match.keyframe.stamp_ns, pair.similarity)
         closure = verifier.verify(pair.query.keyframe, [(candidate, pair.match.keyframe)])[0].closure
