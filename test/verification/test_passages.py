@@ -248,6 +248,12 @@ def test_the_other_heading_is_a_rival_too() -> None:
     assert 0 < good.lead_over([bad, worse]) < 1.0 and bad.lead_over([good]) < 0
 
 
+def test_a_pose_in_a_passage_is_probable_without_rivals_by_points() -> None:
+    verdict = verdict_of(corridor(0.0, 1, UNEVEN, 0.3), corridor(1.5, 2, UNEVEN, 0.3), shift(1.5))
+    assert verdict.probability is not None and verdict.probability > 0.9
+    assert "rival_far" not in verdict.measurements and verdict.measurements["lead"] > 0.9
+
+
 def test_a_passage_that_fits_as_well_turned_round_gives_no_closure(monkeypatch: pytest.MonkeyPatch) -> None:
     def located(*given: Any) -> PassagePosition | None:
         found = locate_along(*given)

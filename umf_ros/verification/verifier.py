@@ -191,6 +191,7 @@ class Verifier:
             return None
         hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
         self._measure(hypothesis)
+        hypothesis.measurements["lead"] = found.lead  # the probability is that of a pose in a passage
         return found
 
     def _probability(self, hypothesis: Hypothesis) -> float:
