@@ -238,6 +238,7 @@ def test_the_keyframes_of_the_helper_start_where_they_say() -> None:
         # a single pair does not know it, thirty do
         ([0.6] * 6, 1.0, ""),
         ([1.6, -0.4] * 15, 1.0, "0.6 px too little disparity"),
+        ([0.8] * 6, 0.0, ""),  # identical images say nothing
         # they disagree by more than they say
         ([3.6, -2.4] * 15, 0.1, ""),
     ],

@@ -131,6 +131,9 @@ def test_a_bias_is_measured_as_well_as_it_says_and_not_from_one_place() -> None:
     bias_px, std_px = moved.measured_bias_px
     assert abs(bias_px - 0.8) < 4 * std_px and abs(bias_px) > abs(moved.bias_px)
     assert still.measured_bias_px[1] > 5 * std_px
+    nothing = replace(moved, residuals=np.zeros((0, 3)), jacobian=np.zeros((0, 3, 7)))
+    exact = replace(moved, residuals=np.zeros_like(moved.residuals))
+    assert np.isnan(nothing.measured_bias_px).all() and exact.measured_bias_px[1] == 0
 
 
 def test_covariance_is_honest_over_many_pairs() -> None:

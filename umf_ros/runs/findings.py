@@ -187,7 +187,7 @@ def _unjudged(about: JudgedRun) -> Iterator[Advice]:
 def _disparity(about: JudgedRun) -> Iterator[Advice]:
     names = ("disparity_bias_px", "disparity_bias_std_px")
     found = [[one.measurements.get(name, nan) for name in names] for one in about.run.candidates if one.accepted]
-    biases_px, sigmas_px = np.array([one for one in found if np.isfinite(one).all()]).reshape(-1, 2).T
+    biases_px, sigmas_px = np.array([one for one in found if one[1] > 0]).reshape(-1, 2).T
     if len(biases_px) < FEW_VIEWS:
         return
     # one pair knows little, for a bias looks the same from one place; all pairs of a run share it

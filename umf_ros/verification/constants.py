@@ -112,9 +112,7 @@ WALL_RAD = np.geomspace(0.2, 0.05, 8)  # by hand: how far the normals of a wall 
 LEVEL_WEIGHT = 0.03  # by hand: of the horizontal as a direction, of the surfaces' weight
 PASSAGE_COMMON = 0.25  # by hand: of the compared points that a rival needs
 PASSAGE_SHIFTS_M = np.arange(-15.0, 15.1, 0.25)  # geometry: as far as scans overlap
-PASSAGE_BESIDE_M = (
-    0.625  # measured: so near a pose are no rivals: a cupboard that is off by half its width fits in part
-)
+PASSAGE_BESIDE_M = 0.625  # measured: nearer poses are no rivals: a cupboard half its width off fits in part
 PASSAGE_RIVALS, PASSAGE_APART = 16, 4  # by hand: of these poses, that are aligned, and shifts between two of them
 PASSAGE_SAME_M = 0.1  # measured: alignments that end so near each other count once; .25 m moves verdicts
 PASSAGE_LEAD, PASSAGE_SIGMAS = 0.08, 1.6  # measured on validation passages: log of the ratio of misfits, and sigmas

@@ -142,7 +142,7 @@ class ViewAlignment:
         """Information (6, 6) of the residuals as if they were independent, whatever the bias of the disparities."""
         if not len(self.residuals):
             return np.zeros((6, 6))
-        whole = self._normal
+        whole = self._normal / self.spread_sigmas**2
         found: Array = whole[:6, :6] - np.outer(whole[:6, 6], whole[6, :6]) / (whole[6, 6] + 1.0)
         return found
 
@@ -150,20 +150,19 @@ class ViewAlignment:
     def measured_bias_px(self) -> tuple[float, float]:
         """Bias of all disparities by these features alone, without its prior, and its standard deviation, pixels.
 
-        From one place and direction a bias looks the same in both views, and its standard deviation is large.
+        From one place and direction a bias looks the same in both views, and its standard deviation is large. NaN where
+        the features do not tell it.
         """
         whole = self._normal
         known = whole[6, 6] - whole[6, :6] @ np.linalg.lstsq(whole[:6, :6], whole[:6, 6], rcond=None)[0]
         if not known > 0:
-            return 0.0, float("inf")
-        by_features = known * self.spread_sigmas**2  # as the estimate weighs them against the prior
-        return self.bias_px * (1.0 + 1.0 / by_features), self.bias_prior_px / math.sqrt(known)
+            return math.nan, math.nan
+        return self.bias_px * (1.0 + 1.0 / known), self.bias_prior_px * self.spread_sigmas / math.sqrt(known)
 
     @property
     def _normal(self) -> Array:
-        """(7, 7) normal matrix of the residuals, by their actual size."""
-        whole = np.einsum("n,nki,nkj->ij", _weight(self.residuals), self.jacobian, self.jacobian)
-        return np.asarray(whole / self.spread_sigmas**2)
+        """(7, 7) normal matrix of the residuals."""
+        return np.asarray(np.einsum("n,nki,nkj->ij", _weight(self.residuals), self.jacobian, self.jacobian))
 
     @property
     def spread_sigmas(self) -> float:
