@@ -115,7 +115,8 @@ PASSAGE_SHIFTS_M = np.arange(-15.0, 15.1, 0.25)  # geometry: as far as scans ove
 PASSAGE_BESIDE_M = 0.625  # measured: nearer poses are no rivals: a cupboard half its width off fits in part
 PASSAGE_RIVALS, PASSAGE_APART = 16, 4  # by hand: of these poses, that are aligned, and shifts between two of them
 PASSAGE_SAME_M = 0.1  # measured: alignments that end so near each other count once; .25 m moves verdicts
-PASSAGE_LEAD, PASSAGE_SIGMAS = 0.08, 1.6  # measured on validation passages: log of the ratio of misfits, and sigmas
+# measured on validation passages: log of the ratio of misfits, and standard deviations, the larger near the identity
+PASSAGE_LEAD, PASSAGE_SIGMAS, PATTERN_SIGMAS = 0.08, 1.6, 2.4
 
 # temporal memory
 MEMORY_KEYFRAMES = 6  # by hand: three metres or more at the usual spacing of keyframes

@@ -240,7 +240,8 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
 
     Poses as far along as scans overlap are compared by some of the points, and the best are aligned. The best of these
     leads another when the misfit of the other is larger, and larger at enough places along the passage: at one place,
-    a door that moved or a person explains it.
+    a door that moved or a person explains it. Near the identity more is asked, for what is left of the pattern's
+    influence is there.
 
     Args:
         match: the matched scan.
@@ -277,7 +278,8 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     sums = np.stack([np.bincount(metre - metre.min(), row) for row in worse])
     sigmas = sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9)
     ratios = (means[elsewhere] - means[first]) / const.PASSAGE_LEAD
-    lead = float(np.minimum(ratios, sigmas / const.PASSAGE_SIGMAS).min())
+    needed = const.PATTERN_SIGMAS if _near_identity(poses[first]) else const.PASSAGE_SIGMAS
+    lead = float(np.minimum(ratios, sigmas / needed).min())
     return PassagePosition(poses[first], lead, means[first], way)
 
 
