@@ -18,6 +18,7 @@ from umf_ros.lab.simulation.domains.passages import PASSAGES, drive
 from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA
 from umf_ros.submaps.history import submap_around
 from umf_ros.verification import Hypothesis, RejectReason, Verifier, verifier
+from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import known_only
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
@@ -239,6 +240,17 @@ def test_hypotheses_along_one_passage_are_compared_once(monkeypatch: pytest.Monk
     verdict = verdict_of(*PAIRS["corridor"], np.eye(4))
     assert 1 <= len(begun) <= 2 and verdict.measurements["lead"] < 1.0
     assert len({bool(pose[0, 0] > 0) for pose in begun}) == len(begun)
+
+
+@pytest.mark.parametrize(("moved_m", "near"), [(0.8, True), (1.5, False)])
+def test_next_to_the_identity_a_pose_must_lead_at_more_places(
+    monkeypatch: pytest.MonkeyPatch, moved_m: float, near: bool
+) -> None:
+    """There the pattern of the rings of one sensor still helps a wrong pose."""
+    pair = corridor(0.0, 1, UNEVEN, 0.3), corridor(moved_m, 2, UNEVEN, 0.3)
+    asked = lead(*pair, shift(moved_m))
+    monkeypatch.setattr(const, "PATTERN_SIGMAS", const.PASSAGE_SIGMAS)
+    assert (asked < lead(*pair, shift(moved_m))) == near
 
 
 def test_the_other_heading_is_a_rival_too() -> None:
