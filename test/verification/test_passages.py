@@ -25,6 +25,7 @@ from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import align_scans
 from umf_ros.verification.scan_consistency import (
     PassagePosition,
+    _peaks,
     ambiguity,
     compare_scans,
     locate_along,
@@ -240,6 +241,12 @@ def test_hypotheses_along_one_passage_are_compared_once(monkeypatch: pytest.Monk
     verdict = verdict_of(*PAIRS["corridor"], np.eye(4))
     assert 1 <= len(begun) <= 2 and verdict.measurements["lead"] < 1.0
     assert len({bool(pose[0, 0] > 0) for pose in begun}) == len(begun)
+
+
+def test_positions_around_the_best_one_leave_room_for_one_far_away() -> None:
+    means = -1.0 + 0.02 * np.abs(np.arange(len(const.PASSAGE_SHIFTS_M)) - 60)
+    means[110] = -0.6
+    assert 110 in _peaks(means)
 
 
 @pytest.mark.parametrize(("moved_m", "near"), [(0.8, True), (1.5, False)])
