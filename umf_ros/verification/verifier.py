@@ -166,9 +166,7 @@ class Verifier:
             if "rival_far" in one.measurements and self._objection(one) is None:
                 theirs, ours = one.scans
                 one.measurements |= known_only({"repetition": repetition(theirs, ours, one.pose)})
-        for one, found in passages:
-            turned = [its for other, its in passages if other is not one and other.candidate is one.candidate]
-            one.measurements["lead"] = found.lead_over(turned)
+        _compare_headings(passages)
         return judged
 
     def _promises(self, hypothesis: Hypothesis, least: float) -> bool:
@@ -276,3 +274,10 @@ class Verifier:
         if 0 < self._settings.max_shift_m < shift_m:
             return RejectReason.TOO_FAR, f"{shift_m:.1f} m > {self._settings.max_shift_m:g}"
         return None
+
+
+def _compare_headings(passages: list[tuple[Hypothesis, PassagePosition]]) -> None:
+    """Of hypotheses in a passage, count the other heading of the same candidate as a rival."""
+    for one, found in passages:
+        turned = [its for other, its in passages if other is not one and other.candidate is one.candidate]
+        one.measurements["lead"] = found.lead_over(turned)
