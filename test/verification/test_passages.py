@@ -21,16 +21,10 @@ from umf_ros.verification import Hypothesis, RejectReason, Verifier, verifier
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import known_only
+from umf_ros.verification.passages import PassagePosition, _peaks, locate_along
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import align_scans
-from umf_ros.verification.scan_consistency import (
-    PassagePosition,
-    _peaks,
-    ambiguity,
-    compare_scans,
-    locate_along,
-    passage_direction,
-)
+from umf_ros.verification.scan_consistency import ambiguity, compare_scans
 
 ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
 AZIMUTHS = np.radians(np.arange(0.0, 360.0, 0.4))
@@ -188,13 +182,13 @@ def test_points_of_different_places_tell_where_submaps_in_a_corridor_were_made()
 
 def test_a_passage_is_found_in_its_direction_and_a_room_is_none() -> None:
     match, query = PAIRS["corridor"]
-    way = passage_direction(match)
+    way = match.passage
     assert way is not None and abs(way[0]) > 0.99
     ways = rays()
     with np.errstate(divide="ignore"):
         reach = np.minimum(corridor_ranges(ways, 0.0, (), 0.5), 2.5 / np.abs(ways[:, 0]))
     room = scan(reach, 7)
-    assert passage_direction(room) is None
+    assert room.passage is None
     assert locate_along(room, room, np.eye(4)) is None
     turn = make_pose(np.array([[0.0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), [0.0, 0.0, 0.0])
     assert locate_along(match, query, turn) is not None  # a wrong heading hides no passage
@@ -203,7 +197,7 @@ def test_a_passage_is_found_in_its_direction_and_a_room_is_none() -> None:
 @pytest.mark.parametrize("x", [0.0, 1.5, -3.0, 5.0])
 def test_cupboards_on_one_side_do_not_turn_the_direction_of_a_passage(x: float) -> None:
     """Half a degree is a tenth of a metre at the end of the search, where a rival would be missed."""
-    way = passage_direction(corridor(x, 1, UNEVEN, 0.3))
+    way = corridor(x, 1, UNEVEN, 0.3).passage
     assert way is not None
     assert abs(np.degrees(np.arctan(way[1] / way[0]))) < 0.12
 
@@ -213,7 +207,7 @@ def test_floor_and_ceiling_tell_the_slope_of_a_passage_where_levelling_errs() ->
     for seen in drive(hallway, 10005)[:3]:
         around = PreparedScan(thin_scan(seen.sweep.points))
         around.up = around.up @ Rotation.from_euler("y", 3.0, degrees=True).as_matrix()
-        way = passage_direction(around)
+        way = around.passage
         assert way is not None
         assert np.degrees(np.arccos(abs(way @ seen.world_T_lidar[0, :3]))) < 0.6
 

@@ -6,13 +6,16 @@ import math
 
 import numpy as np
 import pytest
+from measurements import GOOD
 
 from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification import thin_scan
+from umf_ros.verification.acceptance import refuted
+from umf_ros.verification.hypothesis import RejectReason
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import inspect
-from umf_ros.verification.scan_consistency import ambiguity, compare_scans, repetition
+from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, compare_scans, repetition
 
 RNG = np.random.default_rng(5)
 UP = make_pose(np.eye(3), [0.0, 0.0, 1.5])  # the sensor on its mast
@@ -152,3 +155,29 @@ def test_what_stands_decides_whether_a_place_repeats_and_not_its_bare_ground() -
     poses = np.stack([UP, make_pose(np.eye(3), [1.5, 0.0, 1.5])])
     submap = PreparedScan(flat.points.astype(np.float32), poses, owner=np.arange(len(flat.points)) % 2)
     assert math.isnan(repetition(flat, flat, np.eye(4))) and math.isnan(repetition(submap, submap, np.eye(4)))
+
+
+def ahead(world: Array, x: float) -> PreparedScan:
+    """What a narrow sensor sees of the 6 m ahead of it."""
+    shown = seen(world, make_pose(np.eye(3), [x, 0.0, 0.0]), 6.0).points
+    return PreparedScan(shown[shown[:, 0] > np.abs(shown[:, 1])].astype(np.float32), UP)
+
+
+def test_a_dead_end_shows_walls_alone_and_a_pillar_beside_it_more() -> None:
+    """Its walls and floor fix the pose, and the next dead end of the same building fits as well."""
+    shift = make_pose(np.eye(3), [0.5, 0.0, 0.0])
+    found = []
+    for pillars in (np.empty((0, 2)), np.array([[9.0, 0.4]])):
+        world = box((-60, 10), (-1.2, 1.2), 2.5, pillars)
+        found.append(beyond_walls(ahead(world, 6.5), ahead(world, 7.0), shift))
+    assert found[0] < const.BEYOND_WALLS / 2 and found[1] > 2 * const.BEYOND_WALLS
+
+
+def test_walls_alone_refute_a_pose_and_rocks_in_the_open_need_no_walls() -> None:
+    refutation = refuted(GOOD | {"beyond_walls": 0.01})
+    assert refutation is not None and refutation[0] is RejectReason.WALLS_ALONE and "1%" in refutation[1]
+    assert refuted(GOOD | {"beyond_walls": 0.1}) is None
+    world = hall()
+    flat = seen(world[world[:, 2] < 0.3], np.eye(4))
+    assert math.isnan(beyond_walls(flat, flat, np.eye(4)))
+    assert beyond_walls(MATCH, QUERY, THERE) > 2 * const.BEYOND_WALLS

@@ -122,6 +122,8 @@ def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
         return RejectReason.PASSAGE if _in_passage(measurements) else RejectReason.AMBIGUOUS, ""
     if measurements.get("repetition", math.nan) < const.MIN_REPETITION:
         return RejectReason.AMBIGUOUS, "the scan fits itself elsewhere as well"
+    if measurements.get("beyond_walls", math.nan) < const.BEYOND_WALLS:
+        return RejectReason.WALLS_ALONE, f"{measurements['beyond_walls']:.0%} beyond three walls"
     unexplained = measurements.get("unexplained", math.nan)
     if measurements.get("merged", 1.0) > 1 and "narrow" not in measurements and unexplained > const.SUBMAP_UNEXPLAINED:
         return RejectReason.UNEXPLAINED, f"{unexplained:.0%}"

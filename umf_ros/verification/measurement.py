@@ -50,6 +50,7 @@ MEASUREMENTS = {
     "improbable hypotheses",
     "rival_far": "the same of the best fit 1 to 6 m on; 0 when another pose fits as well",
     "repetition": "logarithm of how much worse what stands around the query fits itself elsewhere than the match here",
+    "beyond_walls": "of what stands and both scans see, the share off its three largest planes",
     "lead": "how much worse points, or surfaces of scans in a passage, fit elsewhere; a closure needs 1",
     "runner_up": "logarithm of how much more is missing at the next best hypothesis about the pair",
     "pose_inliers": "feature pairs that agree with the pose",

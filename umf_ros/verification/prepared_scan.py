@@ -287,6 +287,33 @@ class PreparedScan:
         odd = (np.floor(elevation / const.SIGHT_DEG) % 2).astype(bool)
         return Surfaces.of(self.points[~odd]), Surfaces.of(self.points[odd])
 
+    @cached_property
+    def passage(self) -> Array | None:
+        """(3,) the direction of the passage that it was taken in; None where it shows none.
+
+        A place is a passage where surfaces across it outweigh those along it.
+        """
+        sums, _ = self._least_across(self.normals[self.picks])
+        if sums[0] > const.PASSAGE_RATIO * sums[1]:  # most places are none: their planes are never asked for
+            return None
+        flat = np.concatenate([planes.normals[planes.planar] for planes in self.surfaces])
+        if len(flat) < const.PASSAGE_SURFACE * len(self.points):
+            return None
+        # door frames, windows and goods show sides along it, and not evenly: walls and floor tell its direction
+        way, up = self._least_across(flat)[1], self.up[2]
+        for spread in const.WALL_RAD:
+            weights = 1.0 / (1.0 + (flat @ way / spread) ** 2) ** 2
+            level = const.LEVEL_WEIGHT * weights.sum() * np.outer(up, up)  # where no floor is seen, it is level
+            way = np.linalg.eigh((flat.T * weights) @ flat + level)[1][:, 0]
+        return way
+
+    def _least_across(self, normals: Array) -> tuple[Array, Array]:
+        """Sums (2,) of squared normals (N, 3) along two horizontal ways, the least first, and its direction (3,)."""
+        level = (normals @ self.up.T)[:, :2]
+        sums, ways = np.linalg.eigh(level.T @ level)
+        way: Array = self.up.T @ np.append(ways[:, 0], 0.0)
+        return sums, way
+
 
 def _cloud_of(points: Array, tree: small_gicp.KdTree | None = None) -> small_gicp.PointCloud:
     """Points (N, 3) with normals and covariances of their own."""

@@ -16,6 +16,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
+from umf_ros.verification.passages import PassagePosition, locate_along
 from umf_ros.verification.pose_search import (
     RotatedMaps,
     TemporalMemory,
@@ -25,7 +26,7 @@ from umf_ros.verification.pose_search import (
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans, inspect
-from umf_ros.verification.scan_consistency import PassagePosition, ambiguity, locate_along, repetition
+from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, repetition
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 
@@ -163,9 +164,8 @@ class Verifier:
             if self._promises(one, least) and (found := self._look_elsewhere(one)):
                 passages.append((one, found))
             one.probability = self._probability(one)
-            if "rival_far" in one.measurements and self._objection(one) is None:
-                theirs, ours = one.scans
-                one.measurements |= known_only({"repetition": repetition(theirs, ours, one.pose)})
+            if one.scans and self._objection(one) is None:
+                one.measurements |= self._commonplace(one)
         _compare_headings(passages)
         return judged
 
@@ -191,6 +191,15 @@ class Verifier:
         self._measure(hypothesis)
         hypothesis.measurements["lead"] = found.lead  # the probability is that of a pose in a passage
         return found
+
+    @staticmethod
+    def _commonplace(hypothesis: Hypothesis) -> dict[str, float]:
+        """What tells whether the scans show anything that other places do not."""
+        theirs, ours = hypothesis.scans
+        found = {"beyond_walls": beyond_walls(theirs, ours, hypothesis.pose)}
+        if "rival_far" in hypothesis.measurements:  # in a passage all positions were compared
+            found["repetition"] = repetition(theirs, ours, hypothesis.pose)
+        return known_only(found)
 
     def _probability(self, hypothesis: Hypothesis) -> float:
         """That a hypothesis is right; where scans show bare ground alone, nothing would refute a texture seen twice."""

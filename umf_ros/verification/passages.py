@@ -1,0 +1,142 @@
+"""Position of two scans along a passage: a corridor, tunnel, aisle or street canyon.
+
+Scans look much the same all along. The pattern of one sensor lies on floor, walls and ceiling in the same way wherever
+it stands. Points of two scans therefore coincide at the identity pose although the places differ, and an alignment of
+points that begins near it stays there. All positions along a passage are therefore compared, and a point's distance is
+that to a plane of the other scan. Points of one half of a scan, every second band of elevations, are compared with
+planes of the other half alone: no ring meets itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.core.geometry import Array, evenly, invert, near, transform
+from umf_ros.verification import constants as const
+from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur
+from umf_ros.verification.scan_alignment import run_gicp
+from umf_ros.verification.scan_consistency import at_poses, mean_misfits, near_identity, patterned, shifted
+from umf_ros.verification.visibility import Sight
+
+Misfits = tuple[Array, NDArray[np.bool_]]
+"""(K, N) of points at poses, from 0 on a surface to 1 off all or in space seen empty; and whether they are known."""
+
+
+class PassagePosition(NamedTuple):
+    """The pose `match_T_query` (4, 4) at which two scans in a passage fit best, and its direction (3,) there.
+
+    The lead is how much worse they fit elsewhere along the passage, as a share of what a closure needs; the misfit the
+    logarithm of the mean.
+    """
+
+    pose: Array
+    lead: float
+    misfit: float
+    way: Array
+
+    def lead_over(self, others: Iterable[PassagePosition]) -> float:
+        """The lead, also over the positions of the same scans turned round."""
+        return min([self.lead, *((other.misfit - self.misfit) / const.PASSAGE_LEAD for other in others)])
+
+    def compared(self, pose: Array) -> bool:
+        """Whether a pose, up to its position along the passage, is this one: it was compared with it."""
+        moved = pose.copy()
+        moved[:3, 3] += (self.pose[:3, 3] - pose[:3, 3]) @ self.way * self.way
+        return near(moved, self.pose, const.DISTINCT_M, const.DISTINCT_RAD)
+
+
+def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> PassagePosition | None:
+    """Return the pose along a passage at which the surfaces of two scans fit best; None elsewhere, and for submaps.
+
+    Poses as far along as scans overlap are compared by some of the points, and the best are aligned. The best of these
+    leads another when the misfit of the other is larger, and larger at enough places along the passage: at one place,
+    a door that moved or a person explains it. Near the identity more is asked, for what is left of the pattern's
+    influence is there.
+
+    Args:
+        match: the matched scan.
+        query: the query's scan.
+        pose: (4, 4) `match_T_query`, a pose along the passage.
+    """
+    if not patterned(match, query):
+        return None
+    way = match.passage
+    if way is None and query.passage is not None:
+        way = pose[:3, :3] @ query.passage
+    if way is None:
+        return None
+    along = shifted(pose, way, const.PASSAGE_SHIFTS_M)
+    best = along[_peaks(_means(*_misfits(match, query, along, const.SCOUT_EVERY)))]
+    distinct: list[tuple[Array, Array]] = []
+    for one in best:  # half of them end where another does: a few points show it
+        end = run_gicp(match, query.scouts_cloud, one, const.FINE_REACH_M)
+        if not any(near(end, other, const.PASSAGE_SAME_M, np.pi) for _, other in distinct):
+            distinct.append((one, end))
+    aligned = [run_gicp(match, query.sample_cloud, one, const.FINE_REACH_M) for one, _ in distinct]
+    poses = np.stack([pose, *aligned, *best])  # alignments may all end at one pose
+    misfits, known = _misfits(match, query, poses)
+    means = _means(misfits, known)
+    first = int(np.argmin(means[: 1 + len(aligned)]))
+    elsewhere = np.abs((poses[:, :3, 3] - poses[first, :3, 3]) @ way) > const.PASSAGE_BESIDE_M
+    elsewhere &= means < 0.0  # of the others too few points are known
+    if not elsewhere.any():
+        return PassagePosition(poses[first], 0.0, means[first], way)
+    both = known[elsewhere] & known[first]
+    worse = np.where(both, misfits[elsewhere] - misfits[first], 0.0)
+    points = [transform(poses[first], half) for half in _halves(query)] + _halves(match)
+    metre = np.floor(np.concatenate(points) @ way).astype(int)
+    sums = np.stack([np.bincount(metre - metre.min(), row) for row in worse])
+    sigmas = sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9)
+    ratios = (means[elsewhere] - means[first]) / const.PASSAGE_LEAD
+    needed = const.PATTERN_SIGMAS if near_identity(poses[first]) else const.PASSAGE_SIGMAS
+    lead = float(np.minimum(ratios, sigmas / needed).min())
+    return PassagePosition(poses[first], lead, means[first], way)
+
+
+def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Misfits:
+    """Misfits of one in so many points of both scans with surfaces of the other at poses (K, 4, 4) `match_T_query`."""
+    sigma_m = const.PLANE_SIGMA_M + 2 * common_blur(match, query)
+    parts = [
+        _misfits_with(scan, planes, points, at, sigma_m)
+        for scan, other, at in ((match, query, poses), (query, match, invert(poses)))
+        for planes, points in zip(scan.surfaces, _halves(other, every), strict=True)
+    ]
+    misfits, known = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
+    return misfits, known
+
+
+def _misfits_with(scan: PreparedScan, planes: Surfaces, points: Array, poses: Array, sigma_m: float) -> Misfits:
+    """Misfits of points (N, 3) with planes of a scan."""
+    moved = at_poses(poses, points)
+    found, squared = planes.tree.batch_nearest_neighbor_search(moved, num_threads=1)
+    index = np.asarray(found, np.intp)
+    away = np.einsum("ij,ij->i", moved - planes.centres[index], planes.normals[index])
+    sigmas = (away / sigma_m) ** 2
+    passed = scan.look_at(moved) == Sight.PASSED
+    close = planes.planar[index] & (np.asarray(squared) < planes.reach_m[index] ** 2)
+    shape = len(poses), len(points)
+    return np.where(passed, 1.0, sigmas / (1.0 + sigmas)).reshape(shape), (passed | close).reshape(shape)
+
+
+def _means(misfits: Array, known: NDArray[np.bool_]) -> Array:
+    """(K,) logarithm of the mean misfit of a pose; that of 1 where far fewer points than elsewhere are known."""
+    fewest = max(const.FEWEST_POINTS, const.PASSAGE_COMMON * known.sum(axis=1).max(initial=0))
+    return np.log(mean_misfits(misfits, known, fewest, 1.0) + const.MISFIT_FLOOR)
+
+
+def _peaks(means: Array) -> list[int]:
+    """The best of the shifts along a passage, a metre and more apart from each other, by their mean misfits."""
+    picks: list[int] = []
+    for number in np.argsort(means).tolist():
+        if len(picks) < const.PASSAGE_RIVALS and all(abs(number - other) >= const.PASSAGE_APART for other in picks):
+            picks.append(number)
+    return picks
+
+
+def _halves(scan: PreparedScan, every: int = 1) -> list[Array]:
+    """Some points (N, 3) of each half of a scan, the half first whose bands the first planes lie between."""
+    return [half.points[evenly(len(half.points), const.SAMPLE // 2)[::every]] for half in reversed(scan.surfaces)]
