@@ -158,7 +158,7 @@ def test_what_stands_decides_whether_a_place_repeats_and_not_its_bare_ground() -
 
 
 def ahead(world: Array, x: float) -> PreparedScan:
-    """What a narrow sensor sees of the 6 m ahead of it."""
+    """The view of a narrow sensor of the 6 m ahead of it."""
     shown = seen(world, make_pose(np.eye(3), [x, 0.0, 0.0]), 6.0).points
     return PreparedScan(shown[shown[:, 0] > np.abs(shown[:, 1])].astype(np.float32), UP)
 

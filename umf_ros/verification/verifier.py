@@ -194,7 +194,7 @@ class Verifier:
 
     @staticmethod
     def _commonplace(hypothesis: Hypothesis) -> dict[str, float]:
-        """What tells whether the scans show anything that other places do not."""
+        """Measurements of how much the scans show that other places do not."""
         theirs, ours = hypothesis.scans
         found = {"beyond_walls": beyond_walls(theirs, ours, hypothesis.pose)}
         if "rival_far" in hypothesis.measurements:  # in a passage all positions were compared
