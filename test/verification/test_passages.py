@@ -254,11 +254,24 @@ def test_next_to_the_identity_a_pose_must_lead_at_more_places(
     assert (asked < lead(*pair, shift(moved_m))) == near
 
 
+def position(*misfits: float, lead: float = 2.0) -> PassagePosition:
+    """A position whose points, ten at each metre, have these misfits metre by metre."""
+    points, metre = np.repeat(misfits, 10), np.repeat(np.arange(len(misfits)), 10)
+    known = np.ones(len(points), bool)
+    away = shift(5.0)
+    return PassagePosition(away, np.array([1.0, 0.0, 0.0]), math.log(points.mean()), points, known, metre, lead)
+
+
 def test_the_other_heading_is_a_rival_too() -> None:
-    way = np.array([1.0, 0.0, 0.0])
-    good, worse, bad = (PassagePosition(np.eye(4), 2.0, math.log(misfit), way) for misfit in (0.2, 0.21, 0.3))
-    assert good.lead_over([]) == good.lead_over([bad]) == 2.0
+    good, worse, bad = (position(*10 * [misfit]) for misfit in (0.2, 0.21, 0.3))
+    assert good.lead_over([]) == 2.0 and good.lead_over([bad]) == pytest.approx(10**0.5 / const.PASSAGE_SIGMAS)
     assert 0 < good.lead_over([bad, worse]) < 1.0 and bad.lead_over([good]) < 0
+
+
+def test_a_single_thing_is_no_evidence_of_a_heading_either() -> None:
+    """A door that was opened between the visits fits at one heading only, at one metre of the passage."""
+    one_metre = position(*9 * [0.2], 0.9)
+    assert position(*10 * [0.2]).lead_over([one_metre]) < 1.0
 
 
 def test_a_pose_in_a_passage_is_probable_without_rivals_by_points() -> None:
@@ -270,7 +283,7 @@ def test_a_pose_in_a_passage_is_probable_without_rivals_by_points() -> None:
 def test_a_passage_that_fits_as_well_turned_round_gives_no_closure(monkeypatch: pytest.MonkeyPatch) -> None:
     def located(*given: Any) -> PassagePosition | None:
         found = locate_along(*given)
-        return found and found._replace(lead=2.0, misfit=-1.0)
+        return found and found._replace(lead=2.0, mean=-1.0, misfits=0.0 * found.misfits)
 
     monkeypatch.setattr(verifier, "locate_along", located)
     verdict = verdict_of(*PAIRS["corridor"], np.eye(4))

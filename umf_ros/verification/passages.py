@@ -9,7 +9,6 @@ planes of the other half alone: no ring meets itself.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -27,20 +26,45 @@ Misfits = tuple[Array, NDArray[np.bool_]]
 
 
 class PassagePosition(NamedTuple):
-    """The pose `match_T_query` (4, 4) at which two scans in a passage fit best, and its direction (3,) there.
+    """The pose `match_T_query` at which two scans in a passage fit best along it, at one heading.
 
-    The lead is how much worse they fit elsewhere along the passage, as a share of what a closure needs; the misfit the
-    logarithm of the mean.
+    Attributes:
+        pose: (4, 4).
+        way: (3,) direction of the passage, match frame.
+        mean: logarithm of the mean misfit.
+        misfits, known: (N,) of the points of both scans, as in `Misfits`.
+        metre: (N,) of each point along the passage.
+        lead: how much worse the scans fit elsewhere along the passage, as a share of what a closure needs.
     """
 
     pose: Array
-    lead: float
-    misfit: float
     way: Array
+    mean: float
+    misfits: Array
+    known: NDArray[np.bool_]
+    metre: NDArray[np.int64]
+    lead: float = np.inf
 
-    def lead_over(self, others: Iterable[PassagePosition]) -> float:
-        """The lead, also over the positions of the same scans turned round."""
-        return min([self.lead, *((other.misfit - self.misfit) / const.PASSAGE_LEAD for other in others)])
+    def lead_over(self, rivals: list[PassagePosition]) -> float:
+        """The lead, also over positions of the same scans turned round."""
+        if not rivals:
+            return self.lead
+        rows = zip(*((one.mean, one.misfits, one.known) for one in rivals), strict=True)
+        return min(self.lead, float(self.leads(*map(np.stack, rows)).min()))
+
+    def leads(self, means: Array, misfits: Array, known: NDArray[np.bool_]) -> Array:
+        """(K,) leads over rivals with the means (K,) of misfits (K, N).
+
+        The misfit of a rival must be larger, and larger at enough places along the passage: at one place, a door that
+        moved or a person explains it. Near the identity more is asked, for what is left of the pattern's influence is
+        there.
+        """
+        worse = np.where(known & self.known, misfits - self.misfits, 0.0)
+        sums = np.stack([np.bincount(self.metre, row) for row in worse])
+        sigmas = sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9)
+        needed = const.PATTERN_SIGMAS if near_identity(self.pose) else const.PASSAGE_SIGMAS
+        found: Array = np.minimum((means - self.mean) / const.PASSAGE_LEAD, sigmas / needed)
+        return found
 
     def compared(self, pose: Array) -> bool:
         """Whether a pose, up to its position along the passage, is this one: it was compared with it."""
@@ -52,10 +76,7 @@ class PassagePosition(NamedTuple):
 def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> PassagePosition | None:
     """Return the pose along a passage at which the surfaces of two scans fit best; None elsewhere, and for submaps.
 
-    Poses as far along as scans overlap are compared by some of the points, and the best are aligned. The best of these
-    leads another when the misfit of the other is larger, and larger at enough places along the passage: at one place,
-    a door that moved or a person explains it. Near the identity more is asked, for what is left of the pattern's
-    influence is there.
+    Poses as far along as scans overlap are compared by some of the points, and the best are aligned.
 
     Args:
         match: the matched scan.
@@ -81,20 +102,14 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     misfits, known = _misfits(match, query, poses)
     means = _means(misfits, known)
     first = int(np.argmin(means[: 1 + len(aligned)]))
+    points = [transform(poses[first], half) for half in _halves(query)] + _halves(match)
+    metre = np.floor(np.concatenate(points) @ way).astype(np.int64)
+    found = PassagePosition(poses[first], way, means[first], misfits[first], known[first], metre - metre.min())
     elsewhere = np.abs((poses[:, :3, 3] - poses[first, :3, 3]) @ way) > const.PASSAGE_BESIDE_M
     elsewhere &= means < 0.0  # of the others too few points are known
     if not elsewhere.any():
-        return PassagePosition(poses[first], 0.0, means[first], way)
-    both = known[elsewhere] & known[first]
-    worse = np.where(both, misfits[elsewhere] - misfits[first], 0.0)
-    points = [transform(poses[first], half) for half in _halves(query)] + _halves(match)
-    metre = np.floor(np.concatenate(points) @ way).astype(int)
-    sums = np.stack([np.bincount(metre - metre.min(), row) for row in worse])
-    sigmas = sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9)
-    ratios = (means[elsewhere] - means[first]) / const.PASSAGE_LEAD
-    needed = const.PATTERN_SIGMAS if near_identity(poses[first]) else const.PASSAGE_SIGMAS
-    lead = float(np.minimum(ratios, sigmas / needed).min())
-    return PassagePosition(poses[first], lead, means[first], way)
+        return found._replace(lead=0.0)
+    return found._replace(lead=float(found.leads(means[elsewhere], misfits[elsewhere], known[elsewhere]).min()))
 
 
 def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Misfits:

@@ -301,8 +301,8 @@ class PreparedScan:
             return None
         # door frames, windows and goods show sides along it, and not evenly: walls and floor tell its direction
         way, up = self._least_across(flat)[1], self.up[2]
-        for spread in const.WALL_RAD:
-            weights = 1.0 / (1.0 + (flat @ way / spread) ** 2) ** 2
+        for _ in range(const.STEPS):
+            weights = 1.0 / (1.0 + (flat @ way / const.WALL_RAD) ** 2) ** 2
             level = const.LEVEL_WEIGHT * weights.sum() * np.outer(up, up)  # where no floor is seen, it is level
             way = np.linalg.eigh((flat.T * weights) @ flat + level)[1][:, 0]
         return way

@@ -199,6 +199,11 @@ class PairedViews:
         """Whether the query is the source."""
         return bool(self.query.lifted.sum() >= self.match.lifted.sum())
 
+    @property
+    def _bias_prior_px(self) -> float:
+        """Standard deviation of the bias of the target's disparities before the views are compared, pixels."""
+        return const.DISPARITY_BIAS * (self.match if self._from_query else self.query).camera.width
+
     @cached_property
     def forward(self) -> Array | None:
         """`match_T_query` from the query's points in the match's image."""
@@ -231,7 +236,6 @@ class PairedViews:
             pose = make_pose(turn @ pose[:3, :3], pose[:3, 3] + step[:3])
         fit = self._compare(pose)
         bias = _solve(fit)[1]
-        prior_px = const.DISPARITY_BIAS * self.match.camera.width
         fit = fit.without_bias(bias)
         agree = fit.agreeing
         both = agree & self.query.lifted & self.match.lifted
@@ -240,8 +244,8 @@ class PairedViews:
             pose,
             fit.residuals[agree],
             fit.jacobian[agree],
-            bias * prior_px,
-            prior_px,
+            bias * self._bias_prior_px,
+            self._bias_prior_px,
             self._spread(agree),
             float(np.median(np.linalg.norm(gaps, axis=1))) if len(gaps) else float("nan"),
             float(agree.sum()) / max(int((self.query.lifted | self.match.lifted).sum()), 1),
@@ -277,7 +281,7 @@ class PairedViews:
             by_pose = by_pose @ -np.block([[back, back @ skew(pose[:3, 3])], [np.zeros((3, 3)), back]])
         # more disparity brings the source's point nearer and is added to the target's measurement
         by_bias = scatter[:, :, 2] / source.noise[2] - np.array([0.0, 0.0, 1.0])
-        by_bias = np.where(usable[:, None], by_bias, 0.0) * const.DISPARITY_BIAS * target.camera.width
+        by_bias = np.where(usable[:, None], by_bias, 0.0) * self._bias_prior_px
         jacobian = whiten @ np.concatenate([by_pose, by_bias[:, :, None]], axis=2)
         return _Fit(np.einsum("nij,nj->ni", whiten, residual), jacobian, usable)
 
