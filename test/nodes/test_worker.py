@@ -42,6 +42,20 @@ def test_a_late_worker_drops_the_oldest_and_counts() -> None:
     assert late.done == [0, 8, 9, 10] and late.worker.dropped == 7
 
 
+def test_a_needed_item_is_never_dropped_once_it_is_taken() -> None:
+    """A step that is queued once at a time would never be queued again."""
+    late = HeldUp(queue_size=3)
+    assert late.worker.submit(1, needed=True)
+    for item in range(2, 11):
+        assert late.worker.submit(item)
+    assert late.worker.submit(11, needed=True) and late.worker.submit(12, needed=True)
+    assert not late.worker.submit(13) and not late.worker.submit(14, needed=True)
+    late.gate.set()
+    late.worker.close()
+    assert late.done == [0, 1, 11, 12] and late.worker.dropped == 11
+    assert not late.worker.submit(15, needed=True)
+
+
 def test_submitting_never_waits_for_the_work() -> None:
     gate = threading.Event()
     worker: Worker[int] = Worker(lambda _: gate.wait() and None, lambda _: None, queue_size=2)

@@ -88,6 +88,8 @@ def broken(**changes: object) -> LoopClosure:
         (broken(match_T_query=make_pose(np.eye(3), [1e5, 0, 0])), "absurd translation"),
         (broken(covariance=np.zeros((6, 6))), "not positive definite"),
         (broken(covariance=np.diag([1.0, 1, 1, 1, 1, -1])), "not positive definite"),
+        (broken(covariance=np.diag([1e-7] * 3 + [1e6] * 3)), "not positive definite"),
+        (broken(covariance=1e308 * np.eye(6)), "not finite"),
         (broken(covariance=np.triu(np.ones((6, 6)))), "not symmetric"),
         (broken(covariance=np.full((6, 6), np.inf)), "not finite"),
         (broken(query_stamp_ns=WORLD.message(0).match_stamp_ns), "itself"),

@@ -354,7 +354,8 @@ class BaseNode(LifecycleNode, ABC):
 
         async def answer(request: Any, response: Any) -> Any:
             answered = Future()
-            worker.submit(lambda: act(request, answered))
+            if not worker.submit(lambda: act(request, answered), needed=True):
+                answered.set_result((False, "the node ends, or has too much to do"))
             response.success, response.message = await answered
             return response
 

@@ -88,8 +88,9 @@ class MapNode(BaseNode):
         wanted = self._map.added > MOST_ADDED
         wanted = wanted or any(publisher.get_subscription_count() for publisher in self._publishers_of.values())
         if wanted and not self._queued and time.monotonic() >= self._due_s:
-            self._queued = True
-            self._worker.submit(self._show)
+            self._queued = True  # before the worker can reset it
+            if not self._worker.submit(self._show, needed=True):
+                self._queued = False
         self._diagnose(self._judge(self._own_status()))
 
     def _update(self) -> None:

@@ -77,7 +77,7 @@ class PoseGraphNode(BaseNode):
             self._announce(self._durable.closures())
         self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._on_failure, QUEUE)
         if self._state.unsettled:
-            self._worker.submit(lambda: self._settle_previous())
+            self._worker.submit(lambda: self._settle_previous(), needed=True)
         is_aided = bool(settings.absolute.gnss or settings.absolute.imu)
         calibration = calibration_of(settings) if is_aided else None
         self._odometry_frames = self._subscribe_odometry(self._on_odometry, calibration)
@@ -130,7 +130,7 @@ class PoseGraphNode(BaseNode):
             self._report_fault(error)
 
     def _retune(self, settings: Settings) -> None:
-        self._worker.submit(lambda: self._durable.retune(settings.pose_graph))
+        self._worker.submit(lambda: self._durable.retune(settings.pose_graph), needed=True)
 
     def _on_front_end(self, event: TransitionEvent) -> None:
         self._front_end_busy = event.goal_state.label == "shuttingdown"
@@ -178,8 +178,7 @@ class PoseGraphNode(BaseNode):
         if messages.is_between_rovers(message):
             return
         closure = messages.closure_from_message(message)
-        self._closures_taken += 1
-        self._worker.submit(lambda: self._add_closure(closure))
+        self._closures_taken += self._worker.submit(lambda: self._add_closure(closure), needed=True)
 
     def _add_closure(self, closure: LoopClosure) -> None:
         self._closures_decided += 1
@@ -192,7 +191,7 @@ class PoseGraphNode(BaseNode):
 
     def _on_reject(self, message: String) -> None:
         pair = parse_pair(message.data)
-        self._worker.submit(lambda: self._announce(self._durable.decide_by_hand(*pair, State.REJECTED)))
+        self._worker.submit(lambda: self._announce(self._durable.decide_by_hand(*pair, State.REJECTED)), needed=True)
 
     def _add_odometry(self, sample: OdometrySample) -> None:
         reset = self._durable.take_odometry(sample.stamp_ns, sample.odom_T_body)
@@ -234,8 +233,9 @@ class PoseGraphNode(BaseNode):
 
     def _tick(self) -> None:
         if not self._update_queued:  # queued at most once, however long the worker is busy
-            self._update_queued = True
-            self._worker.submit(self._update)
+            self._update_queued = True  # before the worker can reset it
+            if not self._worker.submit(self._update, needed=True):
+                self._update_queued = False
         self._diagnose(self._judge(self._own_status()))
 
     def _update(self) -> None:

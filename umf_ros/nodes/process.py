@@ -28,28 +28,33 @@ Item = TypeVar("Item")
 class Worker(Generic[Item]):
     """Worker thread that runs `work(item)`, so that `submit` never waits.
 
-    When the queue is full the oldest waiting item is dropped and counted. Exceptions of `work` go to `on_error`.
+    When the queue is full the oldest waiting item that is not needed is dropped and counted; where all are needed, the
+    new one. Exceptions of `work` go to `on_error`.
     """
 
     def __init__(self, work: Callable[[Item], None], on_error: Callable[[Exception], None], queue_size: int) -> None:
         self._work, self._on_error, self._queue_size = work, on_error, queue_size
-        self._queue: deque[Item] = deque()
+        self._queue: deque[tuple[Item, bool]] = deque()
         self._wake = threading.Condition()
         self._closing = self._busy = False
         self.dropped = 0
         self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
         self._thread.start()
 
-    def submit(self, item: Item) -> None:
-        """Queue an item without waiting."""
+    def submit(self, item: Item, needed: bool = False) -> bool:
+        """Queue an item without waiting; return false where it is not taken. A needed one that is taken will be done."""
         with self._wake:
             if self._closing:
-                return
+                return False
             if len(self._queue) == self._queue_size:
-                self._queue.popleft()
                 self.dropped += 1
-            self._queue.append(item)
+                oldest = next((place for place, (_, kept) in enumerate(self._queue) if not kept), None)
+                if oldest is None:
+                    return False
+                del self._queue[oldest]
+            self._queue.append((item, needed))
             self._wake.notify_all()
+            return True
 
     @property
     def waiting(self) -> int:
@@ -74,7 +79,7 @@ class Worker(Generic[Item]):
                 self._wake.wait_for(lambda: bool(self._queue) or self._closing)
                 if not self._queue:
                     return
-                item = self._queue.popleft()
+                item, _ = self._queue.popleft()
                 self._busy = True
             try:
                 with watchdog.task(self._thread.name):
