@@ -231,3 +231,24 @@ def test_a_place_too_far_away_is_exchanged_for_one_halfway_where_the_nearest_is_
     stamps = [keyframe.stamp_ns for keyframe in outing.keyframes]
     match = outing.truth[stamps.index(closure.match_stamp_ns)]
     assert np.linalg.norm((relative(match, true) @ invert(closure.match_T_query))[:3, 3]) < 0.5
+
+
+def test_a_place_from_too_far_adds_no_closure_to_one_that_is_found(
+    outing: Drive, database: PlaceDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Closures of one keyframe are correlated: verification leaves one."""
+    for keyframe in outing.keyframes[:HALF]:
+        database.add(keyframe)
+    finder = SubmapFinder(Verification(), Loop(), database, range(1))
+    query = replace(outing.keyframes[HALF], session=1)
+    found, far = (
+        Hypothesis.of(query, Candidate(row, database[row].stamp_ns, 1.0), database[row], pose=shifted, reason=reason)
+        for row, shifted, reason in (
+            (0, make_pose(np.eye(3), [1.0, 0.0, 0.0]), None),
+            (9, make_pose(np.eye(3), [12.0, 0.0, 0.0]), RejectReason.TOO_FAR),
+        )
+    )
+    nearer = Hypothesis.of(query, Candidate(5, database[5].stamp_ns, 1.0), database[5])
+    monkeypatch.setattr(finder, "_compare_in_turn", lambda *_: [nearer])
+    assert [one.accepted for one in finder._point_to_nearest(query, [found, far])] == [True, False]
+    assert finder._point_to_nearest(query, [far])[0] is nearer

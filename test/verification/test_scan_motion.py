@@ -85,6 +85,18 @@ def test_motion_that_was_not_removed_is_unknown() -> None:
     np.testing.assert_allclose(added, MODEL.unknown_motion, atol=1e-12)
 
 
+def test_the_known_motion_of_one_scan_counts_beside_the_unknown_one_of_the_other() -> None:
+    """As of a submap, merged by odometry that drifts, and a single scan without times."""
+    alignment, _ = aligned(np.random.default_rng(4))
+    noise = np.full(6, 1e-4)
+    merged = keyframe(ScanMotion(np.linspace(-20, 0, COUNT).astype(np.float32), np.zeros(6), noise, removed=False))
+    still = keyframe(ScanMotion.none(COUNT))
+    for unknown, known in (((keyframe(None), merged), (still, merged)), ((merged, keyframe(None)), (merged, still))):
+        stated = [motion_covariance(*pair, alignment, MODEL) for pair in (unknown, known)]
+        np.testing.assert_allclose(*stated)
+        assert np.trace(stated[0]) > 1.5 * np.trace(MODEL.unknown_motion)
+
+
 def test_unknown_motion_is_that_of_a_carrier_on_the_ground() -> None:
     x, y, z, roll, pitch, heading = np.sqrt(np.diag(MODEL.unknown_motion))
     assert x == y == pytest.approx(MODEL.unknown_motion_m) and z < 0.5 * x

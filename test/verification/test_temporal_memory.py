@@ -61,12 +61,21 @@ def test_support_counts_keyframes_not_findings() -> None:
     assert memory.support(*pair(1.0)) == 1
 
 
+def test_a_keyframe_that_is_verified_several_times_supports_once() -> None:
+    """Its scan, and submaps with one place after the other."""
+    memory = TemporalMemory()
+    query, match, pose = pair(0.0)
+    for _ in range(MEMORY_KEYFRAMES + 1):
+        memory.remember(query, [(match, pose, False)])
+    assert memory.support(*pair(1.0)) == 1
+
+
 def test_memory_is_short_and_can_be_cleared() -> None:
     memory = TemporalMemory()
     memory.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
     assert memory.support(*pair(0.5)) == 1
-    for _ in range(MEMORY_KEYFRAMES):
-        memory.remember(pair(0.0)[0], [])
+    for number in range(MEMORY_KEYFRAMES):
+        memory.remember(replace(pair(0.0)[0], stamp_ns=number), [])
     assert memory.support(*pair(0.5)) == 0
     memory.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
     memory.reset()

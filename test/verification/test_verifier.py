@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -274,6 +275,23 @@ def test_what_is_expected_and_found_needs_no_comparison_of_the_others(verifier: 
     for query, match in pairs:
         last = several.verify(query, [*others(4), candidate(match)])
     assert RejectReason.NOT_COMPARED not in {verdict.reason for verdict in last}  # more were asked for
+
+
+def test_the_others_are_compared_where_the_expected_place_is_refuted(
+    verifier: Verifier, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A less probable hypothesis about it that nothing refutes does not decide, and spares no comparison."""
+    pairs, refine = drive(np.eye(4)), Verifier._refine
+    verifier.verify(pairs[0][0], [candidate(pairs[0][1])])
+
+    def refine_with_a_refuted_one(self: Verifier, *given: Any) -> list[Hypothesis]:
+        judged = refine(self, *given)
+        refuted = [replace(one, measurements=one.measurements | {"lead": 0.5}, probability=1.0) for one in judged[:1]]
+        return judged + refuted
+
+    monkeypatch.setattr(Verifier, "_refine", refine_with_a_refuted_one)
+    verdicts = verifier.verify(pairs[1][0], [*others(2), candidate(pairs[1][1])])
+    assert RejectReason.NOT_COMPARED not in {verdict.reason for verdict in verdicts}
 
 
 def test_hypotheses_that_end_at_one_pose_are_judged_once(verifier: Verifier) -> None:

@@ -42,7 +42,7 @@ class Worker(Generic[Item]):
         self._thread.start()
 
     def submit(self, item: Item, needed: bool = False) -> bool:
-        """Queue an item without waiting; return false where it is not taken. A needed one that is taken will be done."""
+        """Queue an item, without waiting; return false where it is not taken. A needed one that is taken is done."""
         with self._wake:
             if self._closing:
                 return False

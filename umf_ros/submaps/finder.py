@@ -135,8 +135,9 @@ class SubmapFinder:
         One from too far is else replaced by the place halfway to what the query sees, with which a narrow sensor that
         drives against the direction of the match shares more.
         """
+        found = any(one.accepted for one in verdicts)
         for far in verdicts:
-            if not (far.accepted or far.reason is RejectReason.TOO_FAR):
+            if not (far.accepted or (far.reason is RejectReason.TOO_FAR and not found)):
                 continue
             match, shift_m = far.keyframes[1], float(np.linalg.norm(far.pose[:3, 3]))
             if match.odom_T_body is None or shift_m < const.SAME_PLACE_M:

@@ -114,7 +114,8 @@ def _in_passage(measurements: Measurements) -> bool:
 def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
     """Why a hypothesis is no closure however probable, with figures; None when nothing refutes it."""
     if kind_of(measurements) == IMAGE:
-        return None
+        repeated = measurements["residual_sigmas"] < const.REPEATED_IMAGE
+        return (RejectReason.REPEATED_IMAGE, "") if repeated else None
     misfit = measurements["residual_m"] / measurements["noise_m"]
     if misfit > const.MAX_MISFIT:
         return RejectReason.MISFIT, f"{misfit:.0f} times"

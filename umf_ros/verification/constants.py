@@ -31,6 +31,7 @@ VIEW_NOISE = {"xfeat": 0.0015, "umf": 0.006}
 DISPARITY_BIAS = 0.0007  # of the image's width, half a pixel: of a rectification that is not quite right, by hand
 VIEW_SAMPLES = 300  # measured: three times as many find 3 % more, a third of them 3 % less
 VIEW_GATE = 11.3  # squared standard deviations, 99 % of a chi-square of three: what agrees, and the kernel
+REPEATED_IMAGE = 0.05  # by hand: no two exposures agree to a twentieth of the features' noise
 NOMINAL_BASELINE_M = 0.2  # S3LI's: how well depths of a camera without a right one are taken to be known
 
 # grid maps: how well do relief and structure fit?

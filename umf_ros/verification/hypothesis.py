@@ -34,6 +34,7 @@ class RejectReason(Enum):
     PASSAGE = "surfaces fit as well elsewhere along the passage"
     AMBIGUOUS = "another pose fits as well"
     WALLS_ALONE = "both scans show the same walls and nothing else, as many places do"
+    REPEATED_IMAGE = "both images are the same to the last digit: the camera repeats its image"
     UNEXPLAINED = "too much of what stands in one submap is missing in the other"
     OUT_OF_RANGE = "a measurement outside the range of the fitted examples"
     TURNED = "turned by more than verification.max_turn_deg"

@@ -9,7 +9,6 @@ by how many of these then have a counterpart. It needs no training and does not 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -227,7 +226,7 @@ class TemporalMemory:
     """Poses found for the last few keyframes, accepted or not; the same live and offline."""
 
     def __init__(self) -> None:
-        self._findings: deque[list[_Finding]] = deque(maxlen=const.MEMORY_KEYFRAMES)
+        self._findings: dict[int, list[_Finding]] = {}  # by the query's stamp
 
     def reset(self) -> None:
         """Forget everything."""
@@ -235,7 +234,9 @@ class TemporalMemory:
 
     def remember(self, query: Keyframe, found: list[tuple[Keyframe, Array, bool]]) -> None:
         """Add what one keyframe found: matched keyframes, `match_T_query` and whether it was accepted."""
-        self._findings.append([_Finding(query, *finding) for finding in found])
+        self._findings.setdefault(query.stamp_ns, []).extend(_Finding(query, *finding) for finding in found)
+        if len(self._findings) > const.MEMORY_KEYFRAMES:
+            del self._findings[next(iter(self._findings))]
 
     def expected(
         self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]
@@ -247,13 +248,13 @@ class TemporalMemory:
 
     def _expected_distance(self, query: Keyframe, match: Keyframe) -> float:
         """Metres between a pair, as odometry carries it over from the latest accepted closure near it; or inf."""
-        accepted = (one for findings in reversed(self._findings) for one in findings if one.accepted)
+        accepted = (one for findings in reversed(self._findings.values()) for one in findings if one.accepted)
         carried = (_carried(finding, query, match) for finding in accepted)
         return next((float(np.linalg.norm(pose[:3, 3])) for pose in carried if pose is not None), float("inf"))
 
     def support(self, query: Keyframe, match: Keyframe, match_T_query: Array) -> float:
         """How many of the remembered earlier keyframes found a pose that odometry carries over to this one."""
-        earlier = [[one for one in findings if one.query.stamp_ns != query.stamp_ns] for findings in self._findings]
+        earlier = [findings for stamp_ns, findings in self._findings.items() if stamp_ns != query.stamp_ns]
         carried = [[_carried(finding, query, match) for finding in findings] for findings in earlier]
         return float(
             sum(any(same_pose(pose, match_T_query) for pose in poses if pose is not None) for poses in carried)

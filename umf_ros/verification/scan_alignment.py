@@ -152,15 +152,15 @@ def motion_covariance(match: Keyframe, query: Keyframe, alignment: Alignment, mo
     """Covariance (6, 6) from the motion during the two scans; zero where no scans were aligned."""
     if not len(alignment.pairs):
         return np.zeros((6, 6))
-    if match.motion is None or query.motion is None:
-        return model.unknown_motion
-    removed = match.motion.removed and query.motion.removed
     ours, theirs = alignment.pairs.T
     turned = np.kron(np.eye(2), alignment.pose[:3, :3])  # errors about the query's axes, seen about the match's
     moved = np.eye(6)  # errors about the match's origin, seen at the query's
     moved[:3, 3:] = -skew(alignment.pose[:3, 3])
-    found = _of_one(query.motion, _bends(alignment, query.motion.moments_s[ours]), turned, model.motion)
-    found = found + _of_one(match.motion, _bends(alignment, match.motion.moments_s[theirs]), moved, model.motion)
+    found, removed = np.zeros((6, 6)), True
+    for motion, rows, axes in ((query.motion, ours, turned), (match.motion, theirs, moved)):
+        if motion is not None:
+            found = found + _of_one(motion, _bends(alignment, motion.moments_s[rows]), axes, model.motion)
+        removed = removed and motion is not None and motion.removed
     return found if removed else found + model.unknown_motion
 
 

@@ -85,7 +85,8 @@ class Verifier:
         # the candidate that odometry predicts from an accepted closure comes first: most often it suffices
         ranked = chosen = self._rank(query, self._memory.expected(query, candidates))
         judged = self._refine(query, chosen, turned, guesses)
-        if sum(self._objection(one) is None for one in judged) < self._settings.max_closures:
+        decisive = _most_probable(judged).values()
+        if sum(self._objection(one) is None for one in decisive) < self._settings.max_closures:
             expected = {candidate.index for candidate, _ in chosen}
             ranked = self._rank(query, candidates)
             others = [one for one in select(ranked, self._settings.refine_best) if one[0].index not in expected]
@@ -241,8 +242,7 @@ class Verifier:
         self, query: Keyframe, ranked: list[Offered], judged: list[Hypothesis], tested: set[int]
     ) -> list[Hypothesis]:
         """The most probable hypothesis of each candidate, decided; accepted ones first."""
-        best = {one.candidate.index: one for one in sorted(judged, key=lambda one: one.probability or 0.0)}
-        found = []
+        best, found = _most_probable(judged), []
         for candidate, keyframe in ranked:
             if candidate.index in best:
                 found.append(best[candidate.index])
@@ -283,6 +283,11 @@ class Verifier:
         if 0 < self._settings.max_shift_m < shift_m:
             return RejectReason.TOO_FAR, f"{shift_m:.1f} m > {self._settings.max_shift_m:g}"
         return None
+
+
+def _most_probable(judged: list[Hypothesis]) -> dict[int, Hypothesis]:
+    """Of hypotheses about each candidate, by its index, the one that decides."""
+    return {one.candidate.index: one for one in sorted(judged, key=lambda one: one.probability or 0.0)}
 
 
 def _compare_headings(passages: list[tuple[Hypothesis, PassagePosition]]) -> None:
