@@ -115,6 +115,21 @@ def test_ending_a_graph_keeps_its_journal(world: GraphWorld, tmp_path: Path) -> 
     assert len(made(tmp_path / "graph.sqlite").graph.trajectory()[0]) <= 10
 
 
+def test_settings_that_were_changed_hold_for_the_next_graph_and_after_a_restart(
+    world: GraphWorld, tmp_path: Path
+) -> None:
+    graph, strict = made(tmp_path / "graph.sqlite"), SETTINGS.model_copy(update={"max_closure_m": 1e-3})
+    graph.retune(strict)
+    graph.end()
+    drive(graph, world, 0, len(world.truth))
+    assert {state for *_, state in states(graph)} == {"refused"}
+    graph.close()
+    again = DurableGraph(strict, tmp_path / "graph.sqlite", [].append)
+    with sqlite3.connect(tmp_path / "graph.sqlite") as connection:
+        assert connection.execute("PRAGMA user_version").fetchone()[0] == again._mark
+    again.close()
+
+
 def test_one_process_writes_and_what_is_no_journal_is_refused(tmp_path: Path) -> None:
     first = made(tmp_path / "graph.sqlite")
     with pytest.raises(UmfError, match="is in use by another process"):

@@ -184,6 +184,8 @@ class LoopDetector:
         self._rules = settings.loop
         self._verifier.retune(settings.verification)
         self._submaps.retune(settings.verification, settings.loop)
+        if self.inter_robot is not None:
+            self.inter_robot.retune(settings.verification)
 
     def process(self, frame: Frame, publish: Callable[[Detection], None] = lambda _: None) -> Detection:
         """Process one frame, in order of stamps within a session; `publish` gets the result before it is stored."""

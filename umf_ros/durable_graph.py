@@ -140,8 +140,10 @@ class DurableGraph:
         self.graph.prepare(within_s)
 
     def retune(self, settings: PoseGraphSettings) -> None:
-        """See `PoseGraph.retune`."""
+        """Use other settings from now on, also in the next graph; see `PoseGraph.retune`."""
+        self._settings = settings
         self.graph.retune(settings)
+        self._write(f"PRAGMA user_version = {self._mark}")
 
     def state(self) -> GraphState:
         """Return the state of the graph."""
@@ -224,6 +226,7 @@ class DurableGraph:
 
     def _begin(self) -> None:
         self.graph = self._make()
+        self.graph.retune(self._settings)
         self.feed = OdometrySessionSplitter(self.graph)
 
     def _resume(self, file: SqliteFile) -> None:

@@ -10,7 +10,7 @@ from submaps_drives import Drive, rough_ground
 from submaps_drives import drive as drive_lidar
 from support.postgres import PostgresServer
 
-from umf_ros.core.config import Settings
+from umf_ros.core.config import Settings, Verification
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import Embedding, Keyframe
 from umf_ros.core.geometry import Array, relative, rotation_angle
@@ -39,16 +39,30 @@ def poses_of(rover: str) -> list[Array]:
     return [pose_at(GROUND, x, 1.2, 6.0, 2.0) for x in PLACES_M]
 
 
-def drive(server: PostgresServer, rover: str) -> list[InterRobotClosure]:
-    """Both places by one rover, whose clock says the same as the other's; what it made of the other's places."""
+def drive(server: PostgresServer, rover: str, later: Verification | None = None) -> list[InterRobotClosure]:
+    """Both places by one rover, whose clock says the same as the other's; what it made of the other's places.
+
+    With other settings after the first place.
+    """
     places = rover_places(server, rover)
     inter_robot = InterRobotMatcher(Settings(database=settings(server, rover)), SubmapHistory(places.store), IDENTITY)
+    found: list[InterRobotClosure] = []
     for place, pose in enumerate(poses_of(rover)):
         inter_robot.link.enqueue(places.add(seen(pose, 10.0 * place, place, 10.0 * place)))
-    found = list(inter_robot.finish(60))
+        if later is not None and place == 0:
+            found += inter_robot.finish(60)
+            inter_robot.retune(later)
+    found += inter_robot.finish(60)
     inter_robot.link.close()
     places.close()
     return found
+
+
+def test_settings_that_are_changed_hold_between_rovers_too(server: PostgresServer) -> None:
+    drive(server, "bea")
+    first, second = drive(server, "ada", later=Verification(min_probability=0.9999))
+    assert any(one.closure is not None for one in first.verdicts)
+    assert {one.reason for one in second.verdicts if one.probability} == {RejectReason.IMPROBABLE}
 
 
 def test_two_rovers_at_two_common_places_get_closures(server: PostgresServer) -> None:

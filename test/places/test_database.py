@@ -71,6 +71,17 @@ def test_other_sessions_may_lie_near_along_the_path_but_never_in_the_future() ->
     assert places.next_session == 1
 
 
+def test_a_stamp_that_comes_again_means_the_newer_keyframe() -> None:
+    """Closures name keyframes by their stamps alone: those of a boot before, with a clock that began at 0 as well."""
+    places = database()
+    for second in (0, 30, 60):
+        places.add(make_keyframe(second, second, session=0))
+    assert stamps_found(places, make_keyframe(100, 0, session=1)) == [0, 30, 60]
+    places.add(make_keyframe(20, 0, session=1))
+    places.add(make_keyframe(30, 10, session=1))
+    assert stamps_found(places, make_keyframe(120, 100, session=1)) == [0, 20, 30]
+
+
 def test_best_match_comes_first_and_weak_ones_can_be_cut() -> None:
     places = database()
     for seed in range(30):

@@ -133,6 +133,22 @@ def test_a_closure_between_unknown_keyframes_times_out() -> None:
     assert verdict.state is State.REFUSED and "no odometry" in verdict.reason
 
 
+@pytest.mark.parametrize("shift_s", [-500, 10**6])
+def test_a_closure_between_unknown_keyframes_times_out_by_the_new_clock(shift_s: int) -> None:
+    """It was set back, or forward: neither counts as waiting."""
+    graph = PoseGraph(SETTINGS)
+    feed_odometry(graph, WORLD, range(100))
+    unknown = replace(WORLD.message(0), match_stamp_ns=10 * PERIOD_NS, query_stamp_ns=3 * 10**6 * PERIOD_NS)
+    graph.add_closure(unknown)
+    graph.begin_session()
+    states = []
+    for k in range(140):
+        graph.add_odometry((k + shift_s) * PERIOD_NS, WORLD.odometry[k])
+        states += [verdict.state for verdict in graph.update()]
+        assert k > SETTINGS.max_pending_s / 2 or not states
+    assert states == [State.REFUSED]
+
+
 def test_a_closure_between_odometry_stamps_is_interpolated() -> None:
     world = rover_loops(300, 12)
     graph = PoseGraph(SETTINGS.model_copy(update={"max_gap_s": 2.5}))

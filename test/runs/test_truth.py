@@ -285,3 +285,12 @@ def test_revisits_are_counted_like_the_database_admits_them() -> None:
     assert find_revisits(stamps, poses, path_length, rules, same_view=False).sum() > 60
     assert find_revisits(stamps, poses, np.full(120, np.nan), rules).sum() == 40
     assert not find_revisits(stamps, poses, path_length, Loop(min_time_gap_s=1000)).any()
+
+
+def test_a_place_of_another_session_is_revisited_wherever_its_path_begins() -> None:
+    """After a reset of the odometry the path length begins again."""
+    x = np.tile(np.arange(100.0), 2)
+    poses = np.stack([place(one, 0, 0) for one in x])
+    stamps, sessions = np.arange(200) * 10**9, np.repeat([0, 1], 100)
+    assert find_revisits(stamps, poses, x, Loop(), sessions=sessions).sum() == 100
+    assert find_revisits(stamps, poses, x, Loop()).sum() < 100

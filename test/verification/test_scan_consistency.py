@@ -181,3 +181,12 @@ def test_walls_alone_refute_a_pose_and_rocks_in_the_open_need_no_walls() -> None
     flat = seen(world[world[:, 2] < 0.3], np.eye(4))
     assert math.isnan(beyond_walls(flat, flat, np.eye(4)))
     assert beyond_walls(MATCH, QUERY, THERE) > 2 * const.BEYOND_WALLS
+
+
+def test_rocks_and_trunks_far_apart_are_no_walls() -> None:
+    """No plane has more than a few of their points."""
+    rocks = RNG.uniform([-20, -20, 0.3], [20, 20, 3.0], (60, 3))
+    ground = np.column_stack([RNG.uniform(-20, 20, (20_000, 2)), np.zeros(20_000)])
+    rounded = rocks[:, None] + 0.3 * RNG.standard_normal((60, 30, 3))
+    scan = seen(np.concatenate([ground, rounded.reshape(-1, 3)]), np.eye(4))
+    assert beyond_walls(scan, scan, np.eye(4)) > 0.5

@@ -9,7 +9,7 @@ from itertools import compress
 
 import numpy as np
 
-from umf_ros.core.config import Settings
+from umf_ros.core.config import Settings, Verification
 from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, invert, near, relative
 from umf_ros.fleet.link import Answer, FleetLink
@@ -121,6 +121,13 @@ class InterRobotMatcher:
         self._settings, self._submaps = settings.verification, submaps
         self.link = FleetLink(submaps.store, settings.database, identity)
         self._verifiers: dict[str, tuple[Verifier, Verifier, FleetConsensus]] = {}
+
+    def retune(self, settings: Verification) -> None:
+        """Verify by other settings from now on."""
+        self._settings = settings
+        for of_scans, of_submaps, _ in self._verifiers.values():
+            of_scans.retune(settings)
+            of_submaps.retune(settings)
 
     def next(self) -> InterRobotClosure | None:
         """Verify the oldest answer of the server; None while there is none."""

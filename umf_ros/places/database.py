@@ -71,8 +71,7 @@ def is_past(age_ns: NDArray[np.int64], path_m: Array, rules: Loop, same_session:
 class PlaceDatabase:
     """Keyframes of all sessions by index, and the search among their descriptors.
 
-    Keyframes are only added. The index of a large file is kept beside it as `<path>.faiss`; it is rebuilt
-    where it is missing or does not match the store.
+    Keyframes are only added. The index of a large file is kept beside it, `<path>.faiss`, and rebuilt without a match.
 
     Args:
         settings: where to keep the keyframes.
@@ -93,6 +92,7 @@ class PlaceDatabase:
         self.store = KeyframeStore(path, (embedder, dimension), settings.cached_keyframes, read_only, outgoing)
         self._index_path = index_path(path) if path is not None else None
         self.listed: range | None = None
+        self._begun: dict[int, int] = {}  # of sessions: closures name stamps, and later clocks may begin again there
         try:
             self.index = self._open_index(dimension)
         except BaseException:
@@ -140,6 +140,7 @@ class PlaceDatabase:
     def add(self, keyframe: Keyframe) -> int:
         """Store a keyframe and return its index."""
         row = self.store.add(keyframe)
+        self._begun.setdefault(keyframe.session, keyframe.stamp_ns)
         self.index.add(keyframe.embedding.descriptor[None])
         self.index.compress()
         if len(self.index) - self._saved >= max(BATCH, self._saved // 4):
@@ -149,9 +150,7 @@ class PlaceDatabase:
     def query(self, keyframe: Keyframe, rules: Loop, sessions: range | None = None) -> list[Candidate]:
         """Return the most similar earlier places, best first.
 
-        Keyframes must be older than `min_time_gap_s`, and those of the same session further back along
-        the path than `min_travel_m`; where either path length is unknown, only the age counts. A place that was
-        visited in many sessions does not displace the others.
+        Keyframes must lie far enough back, by `is_past`. A place of many sessions does not displace the others.
 
         Args:
             keyframe: the query.
@@ -177,7 +176,9 @@ class PlaceDatabase:
         if sessions is not None:
             return np.asarray((keys["session"] >= sessions.start) & (keys["session"] < sessions.stop))
         age_ns, path_m = keyframe.stamp_ns - keys["stamp_ns"], keyframe.path_length_m - keys["travelled_m"]
-        return is_past(age_ns, path_m, rules, keys["session"] == keyframe.session)
+        own = keys["session"] == keyframe.session
+        named = own | (keys["stamp_ns"] < self._begun.get(keyframe.session, keyframe.stamp_ns))
+        return is_past(age_ns, path_m, rules, own) & named
 
     def close(self) -> None:
         """Close the files."""

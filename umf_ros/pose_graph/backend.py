@@ -54,7 +54,7 @@ class PoseGraph:
         self._rejection = OutlierRejection(self._settings, self._sessions)
         # decisions in order of stamps so far, and the sessions with odometry that they are based on
         self._ordered: tuple[list[int], Sessions, OutlierRejection] | None = None
-        self._waiting: list[tuple[LoopClosure, int | None]] = []  # with the newest stamp when the closure came
+        self._waiting: list[tuple[LoopClosure, tuple[int, int] | None]] = []  # with session and stamp since when
         self._held: list[PlacedClosure] = []
         self._settled = False
         self._placed: set[tuple[int, int, int, int, bytes]] = set()
@@ -239,8 +239,13 @@ class PoseGraph:
             check_closure(closure, self._settings.max_closure_m)
         except GraphError as error:
             return self._refuse(closure, error.args[0])
-        self._waiting.append((closure, max((last for _, last in self._spans()), default=None)))
+        self._waiting.append((closure, self._now))
         return None
+
+    @property
+    def _now(self) -> tuple[int, int] | None:
+        """Newest session with odometry, and its last stamp: other sessions may be of another clock."""
+        return next(((one, int(self._sessions.chains[one].stamps[-1])) for one in self._sessions.begun[::-1]), None)
 
     def _refuse(self, closure: LoopClosure, reason: ClosureReason) -> ClosureVerdict:
         self.counts[f"closure refused: {reason}"] += 1
@@ -250,11 +255,11 @@ class PoseGraph:
     def _take_waiting(self) -> tuple[list[ClosureVerdict], list[PlacedClosure]]:
         """Return refusals of closures that were pending too long, and closures whose odometry has arrived."""
         refused, arrived, waiting = [], [], []
-        oldest_ns = min((first for first, _ in self._spans()), default=None)
-        newest_ns = max((last for _, last in self._spans()), default=None)
-        for closure, known_ns in self._waiting:
-            since_ns = newest_ns if known_ns is None else known_ns
-            waited_s = 0.0 if newest_ns is None or since_ns is None else (newest_ns - since_ns) / 1e9
+        oldest_ns = min((chain.span[0] for chain in self._sessions.chains if chain.span), default=None)
+        now = self._now
+        for closure, known in self._waiting:
+            since = known if known and now and known[0] == now[0] else now
+            waited_s = 0.0 if now is None or since is None else (now[1] - since[1]) / 1e9
             query = self._sessions.find(closure.query_stamp_ns)
             match = self._sessions.find(closure.match_stamp_ns, before=query)
             if query is not None and match is not None:
@@ -271,7 +276,7 @@ class PoseGraph:
             elif waited_s > self._settings.max_pending_s:
                 refused.append(self._refuse(closure, ClosureReason.NO_ODOMETRY))
             else:
-                waiting.append((closure, since_ns))
+                waiting.append((closure, since))
         self._waiting = waiting
         return refused, arrived
 
@@ -326,9 +331,6 @@ class PoseGraph:
         """Return the first and last stamp of the odometry of every session; None without any."""
         self._refresh()
         return [chain.span for chain in self._sessions.chains]
-
-    def _spans(self) -> list[tuple[int, int]]:
-        return [chain.span for chain in self._sessions.chains if chain.span is not None]
 
     def map_T_odom(self) -> Array | None:
         """Return (4, 4) pose of the newest session's odometry frame in the map, by its newest pose."""

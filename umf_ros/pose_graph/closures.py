@@ -18,8 +18,7 @@ from umf_ros.pose_graph.odometry import POINT, OdometryChain
 VERDICT_COLUMNS = ("match_stamp_ns", "query_stamp_ns", "verdict", "reason", "mahalanobis", "misfit_m")
 """Columns of a table of verdicts."""
 _LARGEST_SKEW = 1e-3
-# beyond, products and factors of covariances are not exact in double precision (measured: from 1e13 on Cholesky fails)
-_LARGEST_VARIANCE, _LARGEST_CONDITION = 1e15, 1e12
+_LARGEST_VARIANCE, _LARGEST_CONDITION = 1e15, 1e12  # of covariances; measured: Cholesky fails from 1e13 on
 
 
 class ClosureReason(StrEnum):

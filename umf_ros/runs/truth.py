@@ -200,13 +200,14 @@ def judge_run(run: FinishedRun, bag: Bag | None = None) -> JudgedRun:
     if truth is None:
         return JudgedRun(run, bag=bag)
     poses, known = truth.at(run.stamps)
-    stamps, poses, path_length = run.stamps[known], poses[known], run.keyframes["path_length_m"][known]
+    keyframes, poses = run.keyframes[known], poses[known]
+    stamps = keyframes["stamp_ns"]
+    known_of = stamps, poses, keyframes["path_length_m"], rules
     ends, covered = truth.at(np.array([closure.endpoints for closure in run.closures], np.int64).ravel())
     both = np.flatnonzero(covered.reshape(-1, 2).all(axis=1))
     query, match = ends.reshape(-1, 2, 4, 4)[both].swapaxes(0, 1)
     judged = judge_closures([run.closures[row] for row in both], query, match, truth.has_orientation)
-    again = find_revisits(stamps, poses, path_length, rules, same_view=False)
-    same_view = find_revisits(stamps, poses, path_length, rules, truth.has_orientation)
+    again, same_view = (find_revisits(*known_of, view, keyframes["session"]) for view in (False, truth.has_orientation))
     published = {closure.query_stamp_ns for closure in run.closures}
     return JudgedRun(
         run,
@@ -250,7 +251,12 @@ def judge_closures(
 
 
 def find_revisits(
-    stamps: Stamps, world_T_body: Array, path_length_m: Array, rules: Loop, same_view: bool = True
+    stamps: Stamps,
+    world_T_body: Array,
+    path_length_m: Array,
+    rules: Loop,
+    same_view: bool = True,
+    sessions: NDArray[np.int64] | None = None,
 ) -> NDArray[np.bool_]:
     """Return (N,) whether keyframes are revisits, within 12 m and 30 deg of heading of an admissible earlier keyframe.
 
@@ -260,10 +266,13 @@ def find_revisits(
         path_length_m: (N,) path length, NaN where unknown.
         rules: gap rules that earlier keyframes must meet.
         same_view: whether headings count; otherwise a place may be revisited at any heading.
+        sessions: (N,) of odometry, in each of which the path length begins again; None: one session.
     """
+    sessions = np.zeros(len(stamps), np.int64) if sessions is None else sessions
     revisits = np.zeros(len(stamps), bool)
     for row in range(len(stamps)):
-        past = is_past(stamps[row] - stamps[:row], path_length_m[row] - path_length_m[:row], rules)
+        path_m, same_session = path_length_m[row] - path_length_m[:row], sessions[:row] == sessions[row]
+        past = is_past(stamps[row] - stamps[:row], path_m, rules, same_session)
         revisits[row] = bool((_near(world_T_body, row, same_view) & past).any())
     return revisits
 

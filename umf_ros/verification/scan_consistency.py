@@ -159,15 +159,15 @@ def _beyond_walls(scan: PreparedScan, other: PreparedScan, other_T_scan: Array) 
     points, normals = scan.sample[seen], scan.normals[scan.picks][seen]
     if len(points) < const.FEWEST_POINTS:
         return np.nan
-    left = points
+    ways, through = normals[:: const.SCOUT_EVERY], points[:: const.SCOUT_EVERY]
+    offsets, left = np.einsum("ij,ij->i", through, ways), points
     for _ in range(const.WALLS):
-        if len(left) < const.NEIGHBOURS:
-            break
-        ways, through = normals[:: const.SCOUT_EVERY], points[:: const.SCOUT_EVERY]
-        near = np.abs(left @ ways.T - np.einsum("ij,ij->i", through, ways)) < const.WALL_M
+        near = np.abs(left @ ways.T - offsets) < const.WALL_M
         wall = left[near[:, near.sum(axis=0).argmax()]]
+        if len(wall) < const.NEIGHBOURS:
+            break
         centre = wall.mean(axis=0)
-        way = np.linalg.eigh(np.cov((wall - centre).T))[1][:, 0]
+        way = np.linalg.svd(wall - centre, full_matrices=False)[2][2]
         left = left[np.abs((left - centre) @ way) >= const.WALL_M]
     return len(left) / len(points)
 
