@@ -6,9 +6,11 @@ import gc
 import time
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import TransitionEvent
 from processes import wait_until
@@ -17,8 +19,10 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from umf_ros.core.errors import OutputError
+from umf_ros.core.errors import ConfigError, OutputError
 from umf_ros.nodes import diagnostics
+from umf_ros.nodes.base_node import BaseNode
+from umf_ros.nodes.loop_closure_node import LoopClosureNode
 from umf_ros.nodes.pose_graph_node import PoseGraphNode
 
 STALL = "executor_stall_max_ms"
@@ -65,6 +69,28 @@ def test_a_node_that_is_made_anew_is_there_once(node: Back) -> None:
         node.trigger_configure()
         node.trigger_activate()
         assert entities(node) == made
+
+
+@pytest.mark.parametrize("make", [PoseGraphNode, LoopClosureNode])
+def test_what_a_failed_configuration_made_does_not_stand_in_the_way_of_the_next(
+    make: type[BaseNode], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An open graph or database keeps other processes and openings out."""
+    given = ["autostart:=false", f"results_dir:={tmp_path}", "dataset:=s3li-etna", "embedding.method:=solid"]
+    given.append(f"database.path:={tmp_path / 'places.sqlite'}")
+    rclpy.init(args=["--ros-args", *(part for one in given for part in ("-p", one))])
+    node = make()
+
+    def fail(*_: object, **__: object) -> None:
+        raise ConfigError("no such topic")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(make, "_subscribe", fail)
+        assert node.trigger_configure() is TransitionCallbackReturn.FAILURE
+    assert node.trigger_configure() is TransitionCallbackReturn.SUCCESS
+    node.close()
+    node.destroy_node()
+    rclpy.try_shutdown()
 
 
 def test_a_player_that_is_still_starting_is_no_warning(

@@ -8,6 +8,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -182,7 +183,7 @@ class BaseNode(LifecycleNode, ABC):
 
     @abstractmethod
     def _open(self) -> None:
-        """Create everything that the node needs."""
+        """Create everything that the node needs; where that fails, the callbacks of `_opening` release it."""
 
     @abstractmethod
     def _finish(self) -> None:
@@ -200,8 +201,9 @@ class BaseNode(LifecycleNode, ABC):
         self._check_results()
         before, self._unwritten = self._entities(), None
         try:
-            with watchdog.watching(watchdog.PATIENT_S):
+            with watchdog.watching(watchdog.PATIENT_S), ExitStack() as self._opening:
                 self._open()
+                self._opening.pop_all()
             self._opened = True
             # permanent objects: their garbage collection blocked the executor for .3 s
             gc.collect()

@@ -71,10 +71,13 @@ class LoopClosureNode(BaseNode):
         embedder = make_detector_embedder(settings)
         calibration, topics = calibration_of(settings), topics_of(settings)
         self._detector = LoopDetector(settings, embedder)
+        self._opening.callback(self._detector.close)
         self._synchronizer = Synchronizer(settings.sync, calibration, wanted_inputs(topics), warn)
         self._body_frames = self._subscribe_transforms(calibration if settings.uses_transforms else None)
         self._router = MessageRouter(self._synchronizer, topics, warn, frames=self._body_frames)
         self._recorder = RunRecorder(Path(self._results), settings, embedder.name) if self._results else None
+        if self._recorder is not None:
+            self._opening.callback(self._recorder.close)
         self._publisher = ClosurePublisher(self, settings.frames)
         self._lock = threading.Lock()
         self._paused = False

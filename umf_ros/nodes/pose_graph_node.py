@@ -64,6 +64,7 @@ class PoseGraphNode(BaseNode):
         self._frames = settings.frames
         journal = Path(self._results) / JOURNAL if self._results and not settings.localizing else None
         self._durable = start_graph(settings, journal, self._report_fault)
+        self._opening.callback(self._durable.close)
         self._state = self._durable.state()
         # newest odometry in path and markers; None: verdicts have changed since
         self._drawn_ns: int | None = None
