@@ -322,6 +322,17 @@ def test_a_copy_is_complete_although_the_log_was_not_written_back(tmp_path: Path
     assert not list(tmp_path.glob("*.part"))
 
 
+def test_a_copy_makes_nobody_wait_who_writes(tmp_path: Path) -> None:
+    """That of a long drive takes a minute, and the front-end goes on meanwhile."""
+    places = database(filled(tmp_path / "map.sqlite", 5))
+    with places.store._lock:  # as while a keyframe is added
+        copying = threading.Thread(target=places.store.save, args=(tmp_path / "copy.sqlite",), daemon=True)
+        copying.start()
+        copying.join(20.0)
+        assert not copying.is_alive()
+    assert len(database(tmp_path / "copy.sqlite")) == 5
+
+
 def test_a_copy_replaces_an_older_one(tmp_path: Path) -> None:
     target = filled(tmp_path / "copy.sqlite", 9)
     places = database(tmp_path / "map.sqlite")

@@ -8,7 +8,7 @@ import os
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import chain, count
@@ -201,19 +201,25 @@ class SqliteFile:
             raise UmfError(f"{self.name} is damaged: {one_line(error)}") from None
 
     def copy(self, path: Path) -> None:
-        """Write a complete copy in one step while the file stays in use.
+        """Write a complete copy while the file stays in use; only a temporary file must not change meanwhile.
 
         Raises:
             OutputError: the copy cannot be written.
         """
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path, sqlite3.Error) as part:
-            target = sqlite3.connect(part)
-            try:
-                self.connection.backup(target)
-            finally:
-                target.close()
+        with atomic_write(path, sqlite3.Error) as part, ExitStack() as opened:
+            target = opened.enter_context(closing(sqlite3.connect(part)))
+            source = self.connection
+            if self._path is not None:  # a reader of its own makes no writer wait
+                source = sqlite3.connect(f"{self._path.absolute().as_uri()}?mode=ro", uri=True)
+                opened.enter_context(closing(source))
+            source.backup(target)
+
+    @property
+    def is_temporary(self) -> bool:
+        """Whether it disappears with the process."""
+        return self._path is None
 
     def close(self) -> None:
         """Close the file and let other processes write it; a temporary file is deleted."""

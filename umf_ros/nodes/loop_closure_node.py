@@ -92,16 +92,14 @@ class LoopClosureNode(BaseNode):
                 take = partial(self._enqueue, topic)
                 qos = messages.sensor_qos(settings.qos)
                 self._subscribe(name, MESSAGE_TYPES[name], self._own_topic(name, topics), take, qos)
-        if settings.grows_map:
-            self._adder: Worker[Callable[[], None]] = Worker(lambda step: step(), self._report_fault, 1)
-            self._offer_in_turn(self._adder, "~/save", lambda _: self._grow())
-        else:
-            self._offer(Trigger, "~/save", self._save)
+        self._saver: Worker[Callable[[], None]] = Worker(lambda step: step(), self._report_fault, 1)
+        self._offer_in_turn(self._saver, "~/save", lambda _: self._grow() if settings.grows_map else self._save())
         self._offer(Trigger, "~/reset", self._reset)
         self._offer(SetBool, "~/pause", self._pause)
 
     def _finish(self) -> None:
         """Finish every frame in hand and write the results."""
+        self._saver.close(timeout_s=watchdog.PATIENT_S)
         self._decoder.close()
         for frame in self._synchronizer.flush():
             self._worker.submit(frame)
@@ -115,7 +113,6 @@ class LoopClosureNode(BaseNode):
         finally:
             self._detector.close()
         if self._settings.grows_map:
-            self._adder.close(timeout_s=watchdog.PATIENT_S)
             self.get_logger().info(self._grow())
 
     def _grow(self) -> str:
@@ -214,7 +211,7 @@ class LoopClosureNode(BaseNode):
         known = {"fleet_connected": link.connected, "fleet_waiting": waiting, "fleet_pushed": link.pushed}
         return {**known, "fleet_closures": self._between, "fleet_trouble": link.trouble or "none"}
 
-    def _save(self, _: Any) -> str:
+    def _save(self) -> str:
         path = Path(self._settings.database.path or "places.sqlite").with_suffix(".saved.sqlite").resolve()
         self._detector.database.store.save(path)
         return f"{len(self._detector.database)} places saved to {path}"

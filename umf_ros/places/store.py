@@ -7,7 +7,7 @@ import sqlite3
 import threading
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -188,7 +188,7 @@ class KeyframeStore:
 
     def save(self, path: Path) -> None:
         """Write a copy to `path` while the store stays in use."""
-        with self._lock:
+        with self._lock if self._file.is_temporary else nullcontext():
             self._file.copy(path)
 
     def close(self) -> None:
