@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -162,14 +162,19 @@ class LoopDetector:
         self.embedder_name = embedder.name
         self._verifier = Verifier(settings.verification)
         identity = embedder.name, embedder.dimension
-        if settings.localizing:
-            self.database = PlaceDatabase.of_map(Path(settings.map), *identity)
-        else:
-            self.database = PlaceDatabase(settings.database, *identity)
-        self._map = self.database.listed
-        self.seen = PlaceDatabase(settings.database, *identity) if settings.grows_map else None
-        self._submaps = SubmapFinder(settings.verification, settings.loop, self.database, self._map)
-        self.inter_robot = _connect_fleet(settings, embedder, self._submaps.history)
+        with ExitStack() as opened:  # closed again where one of them fails
+            if settings.localizing:
+                self.database = PlaceDatabase.of_map(Path(settings.map), *identity)
+            else:
+                self.database = PlaceDatabase(settings.database, *identity)
+            opened.callback(self.database.close)
+            self._map = self.database.listed
+            self.seen = PlaceDatabase(settings.database, *identity) if settings.grows_map else None
+            if self.seen is not None:
+                opened.callback(self.seen.close)
+            self._submaps = SubmapFinder(settings.verification, settings.loop, self.database, self._map)
+            self.inter_robot = _connect_fleet(settings, embedder, self._submaps.history)
+            opened.pop_all()
         self._session: int | None = None
         self._stored_session = self.database.next_session
         self._ahead_m = 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from umf_ros.core.geometry import align, heading, transform
 from umf_ros.durable_graph import DurableGraph
 from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, AbsoluteWorld, open_ground
+from umf_ros.pose_graph import backend
 from umf_ros.pose_graph.backend import PoseGraph
 
 WORLD = open_ground(10_000, 500.0)
@@ -105,6 +107,18 @@ def test_late_measurements_lead_to_the_same_decisions() -> None:
     ]
     assert np.mean(agree) > 0.97
     assert error_m(late) == pytest.approx(error_m(in_order), abs=0.1)
+
+
+def test_preparing_the_end_leaves_the_world_of_the_map_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The map that is prepared has some of the closures only, and lies otherwise in the world."""
+    graph = drive(of(Aid.GNSS), origin=ORIGIN)
+    before = {component: world.copy() for component, world in graph.reference.worlds.items()}
+    clock_s = iter([0.0, 0.5, 0.5, *[9.0] * 99])
+    monkeypatch.setattr(backend, "time", SimpleNamespace(monotonic=lambda: next(clock_s)))
+    graph.prepare(1.0)
+    assert before and graph.reference.worlds.keys() == before.keys()
+    for component, world in before.items():
+        np.testing.assert_array_equal(graph.reference.worlds[component], world)
 
 
 def test_lies_alone_are_never_believed() -> None:

@@ -154,7 +154,9 @@ class PoseGraph:
             ends = (one.match, one.closure.match_stamp_ns), (one.query, one.closure.query_stamp_ns)
             return all((last_ns[session] > stamp_ns).all() for session, stamp_ns in ends)
 
+        worlds = dict(self.reference.worlds)
         self._reprocess(within_s, has_odometry_beyond)
+        self.reference.worlds = worlds  # of this map, not of the one that is prepared
 
     def settle(self, within_s: float = float("inf")) -> list[ClosureVerdict] | None:
         """Decide finally and solve for the exact optimum, as at the end of a mission.
@@ -255,8 +257,7 @@ class PoseGraph:
     def _take_waiting(self) -> tuple[list[ClosureVerdict], list[PlacedClosure]]:
         """Return refusals of closures that were pending too long, and closures whose odometry has arrived."""
         refused, arrived, waiting = [], [], []
-        oldest_ns = min((chain.span[0] for chain in self._sessions.chains if chain.span), default=None)
-        now = self._now
+        oldest_ns, now = min((span[0] for span in self.session_spans() if span), default=None), self._now
         for closure, known in self._waiting:
             since = known if known and now and known[0] == now[0] else now
             waited_s = 0.0 if now is None or since is None else (now[1] - since[1]) / 1e9

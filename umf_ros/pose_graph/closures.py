@@ -17,8 +17,7 @@ from umf_ros.pose_graph.odometry import POINT, OdometryChain
 
 VERDICT_COLUMNS = ("match_stamp_ns", "query_stamp_ns", "verdict", "reason", "mahalanobis", "misfit_m")
 """Columns of a table of verdicts."""
-_LARGEST_SKEW = 1e-3
-_LARGEST_VARIANCE, _LARGEST_CONDITION = 1e15, 1e12  # of covariances; measured: Cholesky fails from 1e13 on
+_LARGEST_SKEW, _LARGEST_VARIANCE, _LARGEST_CONDITION = 1e-3, 1e15, 1e12  # measured: from 1e13 on Cholesky fails
 
 
 class ClosureReason(StrEnum):
@@ -117,8 +116,7 @@ def as_closures(placed: PlacedClosure, row: int, chains: Sequence[OdometryChain]
 def check_closure(closure: LoopClosure, max_length_m: float) -> Array:
     """Return the (6, 6) covariance of a usable closure in GTSAM's order, tangent space of the query.
 
-    Raises:
-        GraphError: with a `ClosureReason`; also raised by the other checks.
+    Raises a `GraphError` with a `ClosureReason`, as the other checks do.
     """
     if closure.query_stamp_ns == closure.match_stamp_ns:
         raise GraphError(ClosureReason.ITSELF)
