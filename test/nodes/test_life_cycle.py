@@ -7,11 +7,14 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import TransitionEvent
 from processes import wait_until
 from rclpy.executors import SingleThreadedExecutor
@@ -20,10 +23,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from umf_ros.core.errors import ConfigError, OutputError
+from umf_ros.core.geometry import make_pose
 from umf_ros.nodes import diagnostics
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.loop_closure_node import LoopClosureNode
 from umf_ros.nodes.pose_graph_node import PoseGraphNode
+from umf_ros.sensors.decode import OdometrySample
 
 STALL = "executor_stall_max_ms"
 
@@ -91,6 +96,35 @@ def test_what_a_failed_configuration_made_does_not_stand_in_the_way_of_the_next(
     node.close()
     node.destroy_node()
     rclpy.try_shutdown()
+
+
+def test_no_pose_is_told_of_odometry_that_the_correction_is_not_of(node: Back, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An outlier, and the first messages after a reset while the worker is busy with a large graph."""
+    told: list[float] = []
+    monkeypatch.setattr(node, "_pose_publisher", SimpleNamespace(publish=lambda one: told.append(position(one))))
+    newest_s, gate = 100, Event()
+
+    def hear(*x: float) -> None:
+        nonlocal newest_s
+        for one in x:
+            newest_s += 1
+            node._on_odometry(OdometrySample(newest_s * 10**9, make_pose(np.eye(3), [one, 0.0, 0.0])))
+
+    hear(0.0)
+    assert wait_until(lambda: node._corrected == 0)
+    hear(0.5, 1.0, 500.0, 1.5)
+    assert told == [0.5, 1.0, 1.5]
+    node._worker.submit(gate.wait)
+    hear(500.0, 500.5, 501.0)
+    assert told == [0.5, 1.0, 1.5]
+    gate.set()
+    assert wait_until(lambda: node._corrected == 1)
+    hear(501.5)
+    assert told == [0.5, 1.0, 1.5, 501.5]
+
+
+def position(message: PoseWithCovarianceStamped) -> float:
+    return float(message.pose.pose.position.x)
 
 
 def test_a_player_that_is_still_starting_is_no_warning(

@@ -35,6 +35,7 @@ from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.sensors.calibration import Calibration, calibration_of
 from umf_ros.sensors.decode import OdometrySample, stamp_ns
+from umf_ros.sensors.sessions import ODOMETRY, SessionClock, StampedInput
 from umf_ros.sensors.topic_finder import BACK_END
 
 if find_spec("gtsam") is None:  # before inputs are searched: the process of the graph imports it
@@ -66,6 +67,8 @@ class PoseGraphNode(BaseNode):
         self._durable = start_graph(settings, journal, self._report_fault)
         self._opening.callback(self._durable.close)
         self._state = self._durable.state()
+        # sessions of the odometry that came, and the one whose correction is known; none before its first message
+        self._odometry_clock, self._corrected = SessionClock(), -1
         # newest odometry in path and markers; None: verdicts have changed since
         self._drawn_ns: int | None = None
         self._next_draw_s = 0.0
@@ -162,11 +165,13 @@ class PoseGraphNode(BaseNode):
     def _on_odometry(self, sample: OdometrySample) -> None:
         if self._odometry_frames.odom != self._frames.odom:
             self._frames = self._frames.model_copy(update={"odom": self._odometry_frames.odom})
-        self._worker.submit(lambda: self._add_odometry(sample))
-        # the latest correction: the pose never waits for the optimiser
+        decided = self._odometry_clock.take(StampedInput(ODOMETRY, sample.stamp_ns, sample.odom_T_body))[1]
+        session = self._odometry_clock.session
+        self._worker.submit(lambda: self._add_odometry(sample, session))
+        # the latest correction, if it is of this odometry: the pose never waits for the optimiser
         state = self._state
         map_T_odom = state.map_T_odom
-        if map_T_odom is None:
+        if map_T_odom is None or self._corrected != session or not decided or decided[-1].fault:
             return
         pose = messages.pose(sample.stamp_ns, map_T_odom @ sample.odom_T_body, state.covariance, self._frames)
         self._pose_publisher.publish(pose)
@@ -194,11 +199,13 @@ class PoseGraphNode(BaseNode):
         pair = parse_pair(message.data)
         self._worker.submit(lambda: self._announce(self._durable.decide_by_hand(*pair, State.REJECTED)), needed=True)
 
-    def _add_odometry(self, sample: OdometrySample) -> None:
+    def _add_odometry(self, sample: OdometrySample, session: int) -> None:
         reset = self._durable.take_odometry(sample.stamp_ns, sample.odom_T_body)
         if reset is not None:
             self.get_logger().warning(f"{reset.reason}: a new session begins")
+        if reset is not None or session != self._corrected:
             self._correct()
+            self._corrected = session
 
     def _announce(self, verdicts: list[ClosureVerdict]) -> None:
         if not verdicts:
