@@ -39,6 +39,14 @@ def left_behind(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
+def test_sessions_of_a_map_are_not_deleted_behind_its_back(tmp_path: Path) -> None:
+    """It lists them: no command could open it any more."""
+    (tmp_path / "map.json").write_text("{}")
+    (tmp_path / "places.sqlite").touch()
+    ended = umf("places", "delete", tmp_path / "places.sqlite", "--session", "0", "--yes")
+    assert "is of a map" in only_line(ended)
+
+
 def test_help_lists_every_command_with_one_line() -> None:
     ended = umf("--help")
     assert ended.status == 0

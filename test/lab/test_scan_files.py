@@ -166,7 +166,9 @@ def test_what_is_no_scan_is_named_on_one_line(tmp_path: Path, name: str, content
     assert text in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("array", [np.zeros(3), np.zeros((4, 2)), np.zeros((3, 4, 5)), np.array([["a"] * 3])])
+@pytest.mark.parametrize(
+    "array", [np.zeros(3), np.zeros((4, 2)), np.zeros((3, 4, 5)), np.zeros((3, 900)), np.array([["a"] * 3])]
+)
 def test_arrays_that_are_no_scan(tmp_path: Path, array: np.ndarray) -> None:
     np.save(tmp_path / "a.npy", array)
     with pytest.raises(SensorFileError, match=r"expected \(N, 3\) or \(N, 4\) numbers"):

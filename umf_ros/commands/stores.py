@@ -43,6 +43,8 @@ def delete(
     """Delete sessions of a place database for good, after a confirmation."""
     from umf_ros.places.store import check_sessions, delete_sessions
 
+    if (store.parent / "map.json").exists():
+        raise UmfError(f"{store} is of a map, which lists its sessions: make the map again without them")
     check_sessions(store, session)
     if not yes:
         typer.confirm(f"Delete session {', '.join(map(str, session))} of {store} for good?", abort=True)

@@ -21,6 +21,7 @@ from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.reader import message_types
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.config import Topics
+from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose, to_quaternion
 from umf_ros.core.io import read_yaml, write_atomically
 from umf_ros.core.trajectory import Trajectory
@@ -159,6 +160,16 @@ def depth_of(path: Path) -> Array:
 _LAYOUT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 _FLOAT32 = 7
 
+TOPICS = Topics(
+    left_image="/camera/left/image",
+    right_image="/camera/right/image",
+    left_info="",
+    right_info="",
+    cloud="/lidar/points",
+    odometry="",
+)
+"""Of an imported recording: those of no known data set, whose calibration it does not have."""
+
 Entry = tuple[int, str, Callable[[], Any]]
 
 
@@ -166,30 +177,31 @@ def write_recording(found: Imported, out: Path, progress: Callable[[float], None
     """Write OUT.mcap, OUT.calibration.yaml and OUT.yaml; returns the last, the --config of the recording.
 
     Raises:
-        OutputError: one of them cannot be written.
+        OutputError: one of them is there already, or cannot be written.
         SensorFileError: a file of the data set cannot be read.
     """
+    calibration, config = out.with_suffix(".calibration.yaml"), out.with_suffix(".yaml")
+    for path in (out, calibration, config):
+        if path.exists():
+            raise OutputError(f"{path} is there already: nothing was written")
     entries = sorted(_entries(found), key=lambda entry: entry[0])
     with BagWriter(out) as bag:
         for number, (stamp, topic, make) in enumerate(entries, 1):
             bag.write(topic, make(), stamp)
             progress(number / len(entries))
-    calibration, config = out.with_suffix(".calibration.yaml"), out.with_suffix(".yaml")
     notes = "".join(f"# TO BE MEASURED: {what}\n" for what in found.guessed)
     write_atomically(calibration, notes + yaml.safe_dump(found.calibration(), sort_keys=False))
-    absent = {"odometry": "", "left_info": "", "right_info": ""}
-    parameters = {"calibration": str(calibration.resolve()), "topics": absent}
+    parameters = {"calibration": str(calibration.resolve()), "topics": TOPICS.model_dump()}
     write_atomically(config, yaml.safe_dump({"/**": {"ros__parameters": parameters}}, sort_keys=False))
     return config
 
 
 def _entries(found: Imported) -> Iterator[Entry]:
-    topics = Topics()
-    for topic, files in ((topics.left_image, found.left), (topics.right_image, found.right)):
+    for topic, files in ((TOPICS.left_image, found.left), (TOPICS.right_image, found.right)):
         for stamp, path in files:
             yield stamp, topic, lambda stamp=stamp, path=path: image_message(read_image(path), stamp, "camera")  # type: ignore[misc]
     for stamp, read in found.scans:
-        yield stamp, topics.cloud, lambda stamp=stamp, read=read: cloud_message(read(), stamp)  # type: ignore[misc]
+        yield stamp, TOPICS.cloud, lambda stamp=stamp, read=read: cloud_message(read(), stamp)  # type: ignore[misc]
     if found.truth is not None:
         for stamp, pose in zip(found.truth.stamps_ns.tolist(), found.truth.poses, strict=True):
             yield stamp, GROUND_TRUTH_TOPIC, lambda stamp=stamp, pose=pose: pose_message(pose, stamp, "map")  # type: ignore[misc]
@@ -375,7 +387,7 @@ def folder(source: Path) -> Imported:
         name, _, seconds = line.rpartition(" ")
         path = source / name.strip()
         try:
-            stamp = round(float(seconds) * 1e9)
+            stamp = _stamp_ns(seconds)
         except ValueError:
             raise SensorFileError(f"{source / 'times.txt'}: expected lines FILE SECONDS, found {line[:60]!r}") from None
         if path.suffix.lower() in SUFFIXES:
@@ -391,6 +403,14 @@ def folder(source: Path) -> Imported:
     return found
 
 
+def _stamp_ns(seconds: str) -> int:
+    """Nanoseconds of a time in seconds that a message can have, from 1970 to 2038; else a `ValueError`."""
+    number = float(seconds)
+    if not 0 <= number < 2**31:
+        raise ValueError(seconds)
+    return round(number * 1e9)
+
+
 def vslam_lab(source: Path) -> Imported:
     """An export of S3LI Vulcano by VSLAM-LAB: rgb.csv without a header, calibration.yaml; neither scans nor truth."""
     matrix, baseline = _export_calibration(source / "calibration.yaml")
@@ -398,7 +418,7 @@ def vslam_lab(source: Path) -> Imported:
     for line in lines_of(source / "rgb.csv"):
         row = [word.strip() for word in line.split(",")]
         try:
-            left, right = (round(float(row[place]) * 1e9) for place in (0, 2))
+            left, right = (_stamp_ns(row[place]) for place in (0, 2))
         except (ValueError, IndexError):
             raise SensorFileError(
                 f"{source / 'rgb.csv'}: expected SECONDS,FILE,SECONDS,FILE, found {line[:60]!r}"

@@ -270,6 +270,10 @@ def _ply_record(element: PlyElement, form: str) -> Record:
     return np.dtype([(name, _PLY_ORDERS[form] + kind) for name, kind in properties])
 
 
+MOST_COLUMNS = 32
+"""An array with more columns has its points in columns."""
+
+
 def _parse_npy(content: bytes) -> Columns:
     array = None
     with suppress(ValueError, EOFError, OSError):
@@ -278,7 +282,7 @@ def _parse_npy(content: bytes) -> Columns:
         raise SensorFileError("no array of numbers")
     if array.dtype.names:
         return {name.lower(): array[name].ravel() for name in array.dtype.names}
-    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+    if array.ndim != 2 or not 3 <= array.shape[1] <= MOST_COLUMNS or array.dtype.kind not in "fiu":
         raise SensorFileError(f"an array of shape {array.shape}, expected (N, 3) or (N, 4) numbers")
     return _by_name(array)
 

@@ -223,3 +223,12 @@ def test_a_sensor_that_the_transforms_leave_out_and_raw_pictures_are_not_used(
     assert not list(FrameReader(bag, settings_for(bag, None, "auto"), warn=told.append))
     assert any("/tf_static does not say where velodyne is on base_link (parameters" in line for line in told)
     assert any("the images are raw, with lens distortion" in line for line in told)
+
+
+def test_a_recording_of_a_known_data_set_gets_its_calibration(mini_bag: Path, tmp_path: Path) -> None:
+    ended = umf("inspect", mini_bag, "--write", tmp_path)
+    assert "guess" not in ended.text
+    settings = settings_for(open_bag(mini_bag), tmp_path / "my_rover.yaml", "auto")
+    np.testing.assert_array_equal(
+        load_calibration(settings.calibration).body_T_camera, load_calibration("simulated").body_T_camera
+    )

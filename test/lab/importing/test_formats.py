@@ -235,6 +235,25 @@ def test_eurocs_pair_is_rectified(tmp_path: Path) -> None:
     assert imported("euroc", tmp_path)[0].camera.baseline == pytest.approx(0.2, abs=1e-6)
 
 
+def test_an_imported_recording_is_of_no_known_data_set_and_never_overwritten(tmp_path: Path) -> None:
+    """Its calibration may have been measured meanwhile."""
+    imported("folder", tmp_path)
+    assert "no topic of a known data set" in umf("inspect", tmp_path / "made.mcap").text
+    assert "calibration names a file" in only_line(umf("replay", tmp_path / "made.mcap", "--out", tmp_path / "out"))
+    (tmp_path / "made.mcap").unlink()
+    (tmp_path / "made.calibration.yaml").write_text("measured")
+    again = only_line(umf("import", "folder", tmp_path / "set", tmp_path / "made.mcap"))
+    assert again.endswith("made.calibration.yaml is there already: nothing was written")
+    assert (tmp_path / "made.calibration.yaml").read_text() == "measured"
+
+
+@pytest.mark.parametrize("time", ["1625644800000000000", "-5", "1e30", "nan", "soon"])
+def test_times_that_are_no_seconds_are_one_clear_line(tmp_path: Path, time: str) -> None:
+    source = folder(tmp_path / "set")
+    (source / "times.txt").write_text(f"scans/0.bin {time}\n")
+    assert "expected lines FILE SECONDS" in only_line(umf("import", "folder", source, tmp_path / "a.mcap"))
+
+
 def test_the_command_knows_every_format() -> None:
     assert set(KINDS) == set(FORMATS)
 

@@ -311,6 +311,8 @@ def test_training_from_the_command_line(folder, tmp_path, monkeypatch):
     begun, ended = (load_weights(path).state_dict() for path in (start, out / "tiny.safetensors"))
     largest = max(float((begun[name] - ended[name]).abs().max()) for name in begun if name.endswith("head.weight"))
     assert 0 < largest < 0.01  # one step away from where it started
+    with pytest.raises(OutputError, match="holds a run: --resume continues it"):
+        umf("train", folder, "--config", config, "--out", out, "--steps", 2)
     umf("train", folder, "--config", config, "--out", out, "--steps", 2, "--resume")
     assert [row["step"] for row in csv.DictReader((out / "log.csv").open())] == ["1", "2"]
 
@@ -334,13 +336,14 @@ def test_pretraining_from_the_command_line(folder, tmp_path):
     [
         (["train", "nowhere", "--preset", "tiny"], "not a folder"),
         (["train", "nowhere", "--loss", "hinge"], "loss: "),
+        (["train", "{worlds}", "--preset", "tiny", "--device", "foo"], "device: "),
         (["pretrain", "lidar", "nowhere", "--mask-ratio", "0.5"], "mask_ratio is of images"),
         (["pretrain", "image", "nowhere", "--steps", "0"], "steps: "),
     ],
 )
-def test_what_cannot_be_trained_is_said_in_one_line(arguments, word):
+def test_what_cannot_be_trained_is_said_in_one_line(arguments, word, folder, tmp_path):
     with pytest.raises(UmfError, match=word) as raised:
-        umf(*arguments)
+        umf(*(str(part).format(worlds=folder) for part in arguments), "--out", tmp_path / "out")
     assert "\n" not in str(raised.value)
 
 

@@ -23,7 +23,7 @@ from torch import nn
 
 from umf_ros.baselines.place_network import count_parameters
 from umf_ros.core.config import Group, problems
-from umf_ros.core.errors import ConfigError
+from umf_ros.core.errors import ConfigError, OutputError, one_line
 from umf_ros.core.io import read_values
 from umf_ros.core.resources import find
 from umf_ros.core.tasks import spread
@@ -67,8 +67,15 @@ class Team:
 
 
 def choose_device(device: str) -> str:
-    """Name of a torch device; for "auto" a GPU's where there is one."""
-    return device if device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+    """Name of a torch device; for "auto" a GPU's where there is one.
+
+    Raises:
+        ConfigError: torch knows no such device.
+    """
+    try:
+        return str(torch.device(device)) if device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+    except RuntimeError as error:
+        raise ConfigError(f"device: {one_line(error)}") from None
 
 
 @contextmanager
@@ -255,9 +262,11 @@ def train(settings: RunSettings, output: Path, resume: bool, report: Callable[[P
 
     Raises:
         ConfigError: unknown preset, or no data that serves the objective.
-        OutputError: the folder cannot be written.
+        OutputError: the folder cannot be written, or holds a run that is not resumed.
         WeightsError: nothing to resume from, or weights to start from that do not fit.
     """
+    if not resume and (output / "checkpoint.pt").exists():
+        raise OutputError(f"{output} holds a run: --resume continues it, another --out begins a new one")
     objective_type = find_objective(settings.method)
     torch.set_num_threads(settings.threads)
     torch.manual_seed(settings.seed)
