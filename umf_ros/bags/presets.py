@@ -11,7 +11,6 @@ from umf_ros.bags.reader import Bag, decode
 from umf_ros.core.config import Settings, load_preset, load_settings
 from umf_ros.core.errors import BagError, MessageError
 from umf_ros.sensors.calibration import load_calibration
-from umf_ros.sensors.decode import decode_image
 from umf_ros.sensors.tf import TOPIC as TRANSFORMS_TOPIC
 from umf_ros.sensors.topic_finder import known_dataset, must_find, with_topics
 
@@ -23,7 +22,7 @@ GROUND_TRUTH_TOPIC = "/ground_truth/pose"
 def detect_dataset(bag: Bag, own_calibration: bool = False) -> str:
     """Return the data set of a recording: the one with most topics present; its mark counts as one more.
 
-    Its camera_info, or its images, must be of the data set's cameras, unless the calibration is the user's own.
+    Its camera_info must be of the data set's cameras, unless the calibration is the user's own.
 
     Raises:
         BagError: the recording is of no known data set.
@@ -48,19 +47,11 @@ def _contradiction(bag: Bag, name: str) -> str:
         with suppress(MessageError):
             info = decode(raw)
             sizes.append((info.width, info.height))
-    whose = f"{' or '.join(sorted(infos))} is for images"
-    images = {topics.left_image, f"{topics.left_image}/compressed"} & bag.topics.keys()
-    if not sizes and images:
-        whose = f"{' or '.join(sorted(images))} has images"
-        for raw in islice(bag.raw_messages(images), SAMPLES):
-            with suppress(MessageError):
-                height, width = decode_image(decode(raw)).shape
-                sizes.append((width, height))
     expected = load_calibration(name).image_size if sizes else (0, 0)
     if not sizes or expected in sizes:
         return ""
     found = f"{sizes[0][0]} x {sizes[0][1]} pixels, and the camera of that data set has {expected[0]} x {expected[1]}"
-    return f"the recording has topics of {name}, but {whose} of {found}"
+    return f"the recording has topics of {name}, but {' or '.join(sorted(infos))} is for images of {found}"
 
 
 def settings_for(bag: Bag, config: Path | None, dataset: str, **overrides: Any) -> Settings:

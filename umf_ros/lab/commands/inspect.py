@@ -81,11 +81,9 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
 
 def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> None:
     from umf_ros.bags.frames import read_transforms
-    from umf_ros.bags.presets import detect_dataset
-    from umf_ros.core.config import load_preset
-    from umf_ros.core.errors import BagError, writing
+    from umf_ros.core.errors import writing
     from umf_ros.core.io import write_atomically
-    from umf_ros.lab.evaluation.inspection import GUESS, write_calibration, write_settings
+    from umf_ros.lab.evaluation.inspection import GUESS, calibration_of_dataset, write_calibration, write_settings
 
     settings, calibration = folder / "my_rover.yaml", folder / "my_calibration.yaml"
     for path in (settings, calibration):
@@ -93,10 +91,8 @@ def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> 
             raise OutputError(f"{path} is there already: nothing was written")
     with writing(f"to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-    try:
-        text = load_preset(detect_dataset(recording)).calibration.read_text(encoding="utf-8")
-    except BagError:
-        text = write_calibration(found, read_transforms(recording))
+    known = calibration_of_dataset(found, recording)
+    text = write_calibration(found, read_transforms(recording)) if known is None else known.read_text(encoding="utf-8")
     write_atomically(calibration, text)
     write_atomically(settings, write_settings(found, str(calibration.resolve())))
     guesses = text.count(GUESS)

@@ -5,22 +5,23 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.inputs import Advice
-from umf_ros.bags.presets import settings_for
+from umf_ros.bags.presets import detect_dataset, settings_for
 from umf_ros.bags.reader import Bag, decode
 from umf_ros.bags.sensor_check import SensorCheck, SensorReport
-from umf_ros.core.config import Settings, Topics, topics_of
-from umf_ros.core.errors import MessageError, UmfError, either
+from umf_ros.core.config import Settings, Topics, load_preset, topics_of
+from umf_ros.core.errors import BagError, MessageError, UmfError, either
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
 from umf_ros.core.trajectory import Trajectory, bracket
 from umf_ros.runs.findings import gap_remedy
-from umf_ros.sensors.calibration import TO_BE_MEASURED
+from umf_ros.sensors.calibration import TO_BE_MEASURED, load_calibration
 from umf_ros.sensors.decode import OdometrySample, decode_camera_info, decode_cloud, decode_image, decode_odometry
 from umf_ros.sensors.tf import TOPIC, StaticTransforms
 from umf_ros.sensors.topic_finder import find_topics
@@ -205,6 +206,17 @@ def write_settings(found: Inspected, calibration: str) -> str:
         f'      {name}: "{topic}"' for name, topic in found.topics.model_dump().items() if topic or defaults[name]
     ]
     return "\n".join(lines) + "\n"
+
+
+def calibration_of_dataset(found: Inspected, bag: Bag) -> Path | None:
+    """File of the data set that a recording is of; None where there is none, or its images have another size."""
+    try:
+        name = detect_dataset(bag)
+    except BagError:
+        return None
+    image = found.messages.get("left_image")
+    size = None if image is None else decode_image(image).shape[::-1]
+    return load_preset(name).calibration if size in (None, load_calibration(name).image_size) else None
 
 
 def write_calibration(found: Inspected, transforms: StaticTransforms) -> str:
