@@ -229,7 +229,7 @@ def test_a_rival_and_surfaces_apart_refute_scans_however_probable(
 
 
 def test_two_views_without_any_noise_are_one_image_twice() -> None:
-    """A driver that repeats its last image would find itself again wherever the rover drives."""
+    """A driver that repeats its last image: the views agree although the rover has moved."""
     refutation = refuted(GOOD_VIEWS | {"residual_sigmas": 1e-5})
     assert refutation is not None and refutation[0] is RejectReason.REPEATED_IMAGE
     assert refuted(GOOD_VIEWS | {"residual_sigmas": 0.3}) is None

@@ -21,9 +21,8 @@ from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.reader import message_types
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.config import Topics
-from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose, to_quaternion
-from umf_ros.core.io import read_yaml, write_atomically
+from umf_ros.core.io import check_absent, read_yaml, write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.lab.scan_files import IMAGE_SUFFIXES, SUFFIXES, SensorFileError, read_image, read_scan
 from umf_ros.lab.simulation.bag_writer import BagWriter, image_message, pose_message
@@ -181,9 +180,7 @@ def write_recording(found: Imported, out: Path, progress: Callable[[float], None
         SensorFileError: a file of the data set cannot be read.
     """
     calibration, config = out.with_suffix(".calibration.yaml"), out.with_suffix(".yaml")
-    for path in (out, calibration, config):
-        if path.exists():
-            raise OutputError(f"{path} is there already: nothing was written")
+    check_absent(out, calibration, config)
     entries = sorted(_entries(found), key=lambda entry: entry[0])
     with BagWriter(out) as bag:
         for number, (stamp, topic, make) in enumerate(entries, 1):
@@ -317,7 +314,10 @@ def kitti_odometry(source: Path) -> Imported:
     entries = entries_of(path)
     left, right = (entry(entries, name, (3, 4), path) for name in ("P0", "P1"))
     camera_T_body = np.vstack([entry(entries, "Tr", (3, 4), path), [0, 0, 0, 1]])
-    stamps = [KITTI_START_NS + round(float(line) * 1e9) for line in lines_of(source / "times.txt")]
+    try:
+        stamps = [KITTI_START_NS + _stamp_ns(line) for line in lines_of(source / "times.txt")]
+    except ValueError:
+        raise SensorFileError(f"{source / 'times.txt'}: expected lines of SECONDS") from None
     found = Imported({}, invert(camera_T_body))
     found.left, found.right = (_in_order(source / name, stamps) for name in ("image_0", "image_1"))
     found.scans = [(s, partial(read_scan, file, 4)) for s, file in _in_order(source / "velodyne", stamps)]
@@ -502,7 +502,7 @@ def _listed(path: Path) -> list[tuple[int, Path]]:
     """`seconds name` lines of TUM."""
     rows = [line.split() for line in lines_of(path)]
     try:
-        return sorted((round(float(row[0]) * 1e9), path.parent / row[1]) for row in rows)
+        return sorted((_stamp_ns(row[0]), path.parent / row[1]) for row in rows)
     except (ValueError, IndexError):
         raise SensorFileError(f"{path}: expected lines SECONDS FILE") from None
 

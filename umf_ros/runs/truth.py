@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from math import inf, isfinite, nan, radians
 from typing import Any
 
@@ -202,12 +202,12 @@ def judge_run(run: FinishedRun, bag: Bag | None = None) -> JudgedRun:
     poses, known = truth.at(run.stamps)
     keyframes, poses = run.keyframes[known], poses[known]
     stamps = keyframes["stamp_ns"]
-    known_of = stamps, poses, keyframes["path_length_m"], rules
     ends, covered = truth.at(np.array([closure.endpoints for closure in run.closures], np.int64).ravel())
     both = np.flatnonzero(covered.reshape(-1, 2).all(axis=1))
     query, match = ends.reshape(-1, 2, 4, 4)[both].swapaxes(0, 1)
     judged = judge_closures([run.closures[row] for row in both], query, match, truth.has_orientation)
-    again, same_view = (find_revisits(*known_of, view, keyframes["session"]) for view in (False, truth.has_orientation))
+    revisits = partial(find_revisits, stamps, poses, keyframes["path_length_m"], rules, sessions=keyframes["session"])
+    again, same_view = revisits(same_view=False), revisits(same_view=truth.has_orientation)
     published = {closure.query_stamp_ns for closure in run.closures}
     return JudgedRun(
         run,

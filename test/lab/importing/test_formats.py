@@ -254,6 +254,14 @@ def test_times_that_are_no_seconds_are_one_clear_line(tmp_path: Path, time: str)
     assert "expected lines FILE SECONDS" in only_line(umf("import", "folder", source, tmp_path / "a.mcap"))
 
 
+@pytest.mark.parametrize(("kind", "table"), [("tum-rgbd", "rgb.txt"), ("kitti-odometry", "times.txt")])
+def test_other_formats_refuse_times_in_nanoseconds_too(tmp_path: Path, kind: str, table: str) -> None:
+    source = MADE[kind](tmp_path / "set")
+    text = (source / table).read_text()
+    (source / table).write_text(text.replace(text.split()[0], "1625644800000000000", 1))
+    assert table in only_line(umf("import", kind, source, tmp_path / "a.mcap"))
+
+
 def test_the_command_knows_every_format() -> None:
     assert set(KINDS) == set(FORMATS)
 

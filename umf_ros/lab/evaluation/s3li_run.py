@@ -255,7 +255,8 @@ def judged_record(about: JudgedRun, odometry: Trajectory | None) -> Record:
         hits = recall_of_places(stamps, poses[known], path_length, run.descriptors[known], run.settings.loop)
         record |= {"recall1_hits": hits[0], "recall1_queries": hits[1], "recall1": _share(*hits)}
     true = int(closures.is_true.sum())
-    again = find_revisits(stamps, poses[known], path_length, run.settings.loop)
+    sessions = run.keyframes["session"][known]
+    again = find_revisits(stamps, poses[known], path_length, run.settings.loop, sessions=sessions)
     closed = again & np.isin(stamps, closures.query_stamp_ns[closures.is_true])
     overlapping = sum(_overlap(about, poses, one) > LEAST_OVERLAP for one in closures)
     record |= {"closures_true": true, "closures_false": len(closures) - true, "closures_judged": len(closures)}
