@@ -29,13 +29,8 @@ from rich.table import Table
 
 from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.embedding import make_embedder
-from umf_ros.lab.fit.acceptance import (
-    EXAMPLES,
-    bounds_of,
-    fit_decision,
-    load_examples,
-    save_acceptance,
-)
+from umf_ros.lab.fit.acceptance import EXAMPLES, load_examples, save_acceptance
+from umf_ros.lab.fit.scan_acceptance import fit
 from umf_ros.lab.simulation.domains import DOMAINS, STRANGE_DOMAINS, Domain
 from umf_ros.lab.simulation.domains.pairs import (
     FULL,
@@ -47,8 +42,6 @@ from umf_ros.lab.simulation.domains.pairs import (
 )
 from umf_ros.lab.simulation.world import TEST, VALIDATION
 from umf_ros.verification import Verifier
-from umf_ros.verification.acceptance import AcceptanceModel, load_acceptance
-from umf_ros.verification.hypothesis import SCAN
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
 from support.domain_outcomes import Outcome, summary
@@ -106,14 +99,10 @@ def run(domain: Domain, seed: int, extent: Extent, folder: Path | None) -> Outco
 
 def _without(domain: Domain) -> Verifier:
     """A verifier whose decision was fitted, threshold and all, without any example of the domain."""
-    examples = [one for one in load_examples(EXAMPLES) if one.domain != domain.name]
-    shipped = load_acceptance()
-    decision, _ = fit_decision(examples, SCAN, Verification().min_probability)
-    bounds = shipped.bounds | {SCAN: bounds_of(examples, SCAN)}
+    model, _ = fit([one for one in load_examples(EXAMPLES) if one.domain != domain.name])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "acceptance.json"
-        model = AcceptanceModel(shipped.models | {SCAN: decision}, shipped.covariances, bounds)
-        save_acceptance(model, path, {SCAN: f"without {domain.name}"}, {})
+        save_acceptance(model, path, {}, {})
         return Verifier(Verification(calibration=str(path)))
 
 

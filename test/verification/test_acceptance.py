@@ -21,12 +21,14 @@ from umf_ros.verification.acceptance import (
     scores,
 )
 from umf_ros.verification.constants import MAX_MISFIT, MIN_LEAD, MIN_REPETITION, SUBMAP_UNEXPLAINED
-from umf_ros.verification.hypothesis import IMAGE, SCAN, kind_of
+from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, kind_of
 from umf_ros.verification.measurement import MEASUREMENTS
 
+MERGED = {"merged": 9.0}
 RIVALS, STANDING = ("rival_near", "rival_far"), ("upright_counterparts", "unexplained")
 PAIRS = {
     SCAN: (GOOD, BAD),
+    SUBMAP: (GOOD | MERGED, BAD | MERGED),
     IMAGE: (GOOD_VIEWS, BAD_VIEWS),
 }
 NAN = math.nan

@@ -17,7 +17,7 @@ from typing import Any
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.resources import find
 from umf_ros.verification import constants as const
-from umf_ros.verification.hypothesis import IMAGE, SCAN, RejectReason, kind_of
+from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, RejectReason, kind_of
 from umf_ros.verification.scan_alignment import CovarianceModel
 
 SHIPPED = "config/verification/calibration.json"
@@ -66,19 +66,22 @@ def _log_ratio(above: str, below: str, worst: float, best: float) -> Criterion:
 
 
 # every range is by hand: wide enough for right poses, beyond the reach of most wrong ones
+_OF_SCANS = {
+    "tail_like_noise": _log_ratio("noise_m", "residual_p90_m", 0.15, 0.6),
+    "terrain_score": _of("terrain_score", 3.0, 15.0),
+    "common_view": _log_of("common", 0.1, 0.8),
+    "uncontradicted": _log_of("contradiction", 0.3, 0.01, floor=3e-3),
+    "upright_counterparts": _of("upright_counterparts", 0.4, 0.65, missing=0.5),
+    "explained": _log_of("unexplained", 0.2, 0.01, missing=0.5, floor=4e-3),
+    "position_along_known": _of("rival_near", 0.0, 0.1),
+    "no_rival": _of("rival_far", 0.0, 0.3),
+    "position_known": _log_of("position_std_m", 1.0, 0.05),
+    "heading_known": _log_of("heading_std_deg", 5.0, 0.2),
+}
 CRITERIA: dict[str, dict[str, Criterion]] = {
-    SCAN: {
-        "tail_like_noise": _log_ratio("noise_m", "residual_p90_m", 0.15, 0.6),
-        "terrain_score": _of("terrain_score", 3.0, 15.0),
-        "common_view": _log_of("common", 0.1, 0.8),
-        "uncontradicted": _log_of("contradiction", 0.3, 0.01, floor=3e-3),
-        "upright_counterparts": _of("upright_counterparts", 0.4, 0.65, missing=0.5),
-        "explained": _log_of("unexplained", 0.2, 0.01, missing=0.5, floor=4e-3),
-        "position_along_known": _of("rival_near", 0.0, 0.1),
-        "no_rival": _of("rival_far", 0.0, 0.3),
-        "position_known": _log_of("position_std_m", 1.0, 0.05),
-        "heading_known": _log_of("heading_std_deg", 5.0, 0.2),
-    },
+    SCAN: _OF_SCANS,
+    # submaps made from two sides share little
+    SUBMAP: {name: criterion for name, criterion in _OF_SCANS.items() if name != "common_view"},
     IMAGE: {
         "inliers": Criterion(
             lambda known: math.log1p(known.get("inliers_image", 0.0) + known.get("inliers_cloud", 0.0)),
@@ -148,7 +151,7 @@ class AcceptanceModel:
     """Everything that was fitted.
 
     Attributes:
-        models: one logistic model per kind of hypothesis: `SCAN` and `IMAGE`.
+        models: one logistic model per kind of hypothesis: `SCAN`, `SUBMAP` and `IMAGE`.
         covariances: likewise, what turns residuals into a covariance.
         bounds: likewise, least and greatest of what right poses measured, by the name of the number.
     """
@@ -198,7 +201,7 @@ def load_acceptance(path: str = "") -> AcceptanceModel:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         models = {kind: _logistic(content["models"][kind], kind) for kind in CRITERIA}
-        covariances = {kind: CovarianceModel(**content["covariance"][kind]) for kind in (SCAN, IMAGE)}
+        covariances = {kind: CovarianceModel(**content["covariance"][kind]) for kind in CRITERIA}
         bounds = {
             kind: {name: (float(least), float(greatest)) for name, (least, greatest) in numbers.items()}
             for kind, numbers in content.get("bounds", {}).items()

@@ -90,14 +90,12 @@ class GridMap:
 
     @cached_property
     def spectra(self) -> Spectra:
-        """Spectra (2, ...) of relief and structure."""
-        found: Spectra = scipy.fft.rfft2(self.layers.transpose(2, 0, 1))
-        return found
+        """Spectra (4, ...) of relief and structure, and of their squares."""
+        return _spectra_of(self.layers[None])[0]
 
     def turned_spectra(self, headings: Array) -> Spectra:
-        """Conjugated spectra (H, 2, ...) of the maps turned about the sensor by headings (H,), rad."""
-        maps = np.stack([_turned(self.layers, heading) for heading in headings])
-        found: Spectra = scipy.fft.rfft2(maps.transpose(0, 3, 1, 2)).conj()
+        """Conjugated spectra (H, 4, ...) of the maps turned about the sensor by headings (H,), rad."""
+        found: Spectra = _spectra_of(np.stack([_turned(self.layers, heading) for heading in headings])).conj()
         return found
 
 
@@ -175,6 +173,12 @@ def relief_of(height: Array, known: NDArray[np.bool_], cell_m: float) -> Grid:
 def _blur(values: Grid) -> Grid:
     blurred = cv2.GaussianBlur(values, (0, 0), const.PLANE_SIGMA_CELLS, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(blurred, np.float32)
+
+
+def _spectra_of(layers: Grid) -> Spectra:
+    """Spectra (K, 4, ...) of layers (K, side, side, 2) and of their squares."""
+    found: Spectra = scipy.fft.rfft2(np.concatenate([layers, layers**2], axis=3).transpose(0, 3, 1, 2))
+    return found
 
 
 def _turned(maps: Grid, heading: float) -> Grid:

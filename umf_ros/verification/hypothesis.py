@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from umf_ros.verification.view_alignment import PairedViews, ViewAlignment
 
 ACCEPTED = "accepted"
-SCAN, IMAGE = "scan", "image"
+SCAN, SUBMAP, IMAGE = "scan", "submap", "image"
 
 
 class RejectReason(Enum):
@@ -90,7 +90,7 @@ class Hypothesis:
 
     @property
     def kind(self) -> str:
-        """How the pose was measured: `SCAN`, `IMAGE`, or empty without a pose."""
+        """How the pose was measured: `SCAN`, `SUBMAP`, `IMAGE`, or empty without a pose."""
         return kind_of(self.measurements)
 
     @property
@@ -142,7 +142,7 @@ def known_only(measurements: dict[str, float]) -> dict[str, float]:
 
 
 def kind_of(measurements: dict[str, float]) -> str:
-    """Return `SCAN` where two scans were aligned and `IMAGE` where only views were; empty without a pose."""
+    """Return the kind of what was aligned: `SCAN`, `SUBMAP` or, without scans, `IMAGE`; empty without a pose."""
     if "noise_m" in measurements:
-        return SCAN
+        return SUBMAP if measurements.get("merged", 1.0) > 1 else SCAN
     return IMAGE if "pose_inliers" in measurements else ""

@@ -2,8 +2,10 @@
 
 Scans are searched whatever the heading. The query's map is turned to every heading at which the two can see the same
 things and is correlated with the match's over all shifts at once (FFT): its relief alone, and relief with structure; in
-the open the one is right, among walls the other. Every peak is refined by some steps of ICP on a few points, and ranked
-by how many of these then have a counterpart. It needs no training and does not depend on the light.
+the open the one is right, among walls the other. Correlations of submaps are divided by what chance gives: seen from
+two sides, they share little at the right pose and much at others. Every peak is refined by some steps of ICP on a few
+points, and ranked by how many of those that the other scan should see have a counterpart. It needs no training and does
+not depend on the light.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from umf_ros.verification.keypoints import common_keypoints
 from umf_ros.verification.prepared_scan import PreparedScan, levelled, structured, views_decide
 from umf_ros.verification.scan_alignment import run_gicp
 from umf_ros.verification.view_alignment import PairedViews
+from umf_ros.verification.visibility import visible
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +38,7 @@ class Fit:
 
     Attributes:
         pose: (4, 4) `match_T_query`.
-        share: of some of the query's points, how many have a counterpart.
+        share: of some points that the other scan should see, how many have a counterpart; the mean of both ways.
         terrain: how well the relief fits there, in standard deviations of chance.
         structured: whether enough stands around both to be compared, where terrain says nothing.
     """
@@ -65,7 +68,7 @@ class RotatedMaps:
         self._spectra: dict[int, Spectra] = {}
 
     def spectra(self, wanted: NDArray[np.intp]) -> Spectra:
-        """Spectra (H, 2, ...), conjugated, at the headings (H,) by index."""
+        """Spectra (H, 4, ...), conjugated, at the headings (H,) by index."""
         fresh = [index for index in wanted.tolist() if index not in self._spectra]
         if fresh:
             made = self.map.turned_spectra(const.ALL_HEADINGS[fresh])
@@ -81,7 +84,11 @@ def search(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
     if not len(wanted) or min(len(theirs.rows), len(ours.rows)) < const.FEWEST_POINTS:
         return []
     fits = []
-    for index, shift in _peaks(_correlate(theirs, turned.spectra(wanted)), wanted, const.PEAKS, ours.cell_m):
+    correlation, variance = _correlate(theirs, turned.spectra(wanted))
+    if max(match.merged, turned.scan.merged) > 1:
+        variance += const.LEAST_CHANCE * variance.max(axis=(1, 2, 3), keepdims=True)
+        correlation /= np.sqrt(np.maximum(variance, 1e-12))
+    for index, shift in _peaks(correlation, wanted, const.PEAKS, ours.cell_m):
         guess = lifted(match, turned.scan, float(const.ALL_HEADINGS[index]), shift)
         fits.append(coarse_align(match, turned.scan, guess))
     return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
@@ -90,10 +97,18 @@ def search(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
 def coarse_align(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
     """Refine a pose by a few points, and count how many of them find a counterpart."""
     pose = _by_scouts(match, query, guess)
-    squared = match.nearest(transform(pose, query.scouts))[1]
-    close = squared < (const.SCOUT_NEAR * query.cell_m) ** 2
+    reach_m = const.SCOUT_NEAR * query.cell_m
+    ways = (match, transform(pose, query.scouts)), (query, transform(invert(pose), match.scouts))
+    shares = [_found_share(scan, points, reach_m) for scan, points in ways]
     terrain = terrain_fit(match.terrain, query.terrain, levelled(match, query, pose))[1]
-    return Fit(pose, float(close.mean()), terrain, structured(match, query))
+    return Fit(pose, sum(shares) / 2, terrain, structured(match, query))
+
+
+def _found_share(scan: PreparedScan, points: Array, reach_m: float) -> float:
+    """Of the points (N, 3) that a scan should see, the share that it has within a reach; less where these are few."""
+    seen = visible(scan.look_at(points))
+    close = scan.nearest(points)[1] < reach_m**2
+    return float((seen & close).sum()) / max(int(seen.sum()), const.FEWEST_POINTS)
 
 
 def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
@@ -104,7 +119,7 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     level = levelled(match, query, pose)
     theirs, ours = match.map(query.cell_m), query.map(query.cell_m)
     turns = float(heading(level)) + np.array([0.0, np.pi])
-    correlation = _correlate(theirs, ours.turned_spectra(turns))
+    correlation, _ = _correlate(theirs, ours.turned_spectra(turns))
     row, column = np.round(level[:2, 3] / query.cell_m).astype(int) + const.MAP_SHIFT
     correlation[:, 0, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
     found = []
@@ -118,14 +133,14 @@ def _by_scouts(match: PreparedScan, query: PreparedScan, guess: Array) -> Array:
     return run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M)
 
 
-def _correlate(around: GridMap, turned: Spectra) -> NDArray[np.float32]:
-    """Correlation (2, H, shifts, shifts) of the relief, and of relief and structure together."""
+def _correlate(around: GridMap, turned: Spectra) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Correlation (2, H, shifts, shifts) of the relief, and of relief and structure; its variance by chance."""
     products = around.spectra * turned
-    products[:, 1] += products[:, 0]
+    products[:, 1::2] += products[:, ::2]
     window = np.arange(-const.MAP_SHIFT, const.MAP_SHIFT + 1)
     rows = scipy.fft.ifft(products, axis=-2)[..., window, :]
     found: NDArray[np.float32] = scipy.fft.irfft(rows, around.side, axis=-1)[..., window].swapaxes(0, 1)
-    return found
+    return found[:2], np.maximum(found[2:], 0.0)
 
 
 def _peaks(

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from umf_ros.core.geometry import Array
 from umf_ros.runs.truth import normalised_errors, share_inside
 from umf_ros.verification.acceptance import CRITERIA, AcceptanceModel, Logistic, Measurements, refuted, scores
-from umf_ros.verification.hypothesis import IMAGE, SCAN, kind_of
+from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, kind_of
 from umf_ros.verification.measurement import MEASUREMENTS
 from umf_ros.verification.scan_alignment import CovarianceModel, covariance_of
 
@@ -75,9 +75,10 @@ def load_examples(path: Path) -> list[Example]:
 RIDGE = 0.03  # measured: leaving domains out, a tenth of it accepts less at no wrong one
 SAFETY = 0.25  # by hand: log-odds between the most probable wrong pose and the threshold
 # numbers that describe the scans rather than how well they fit; beyond the fitted range their meaning is unknown
-BOUNDED = {SCAN: ("noise_m", "residual_m", "position_std_m", "heading_std_deg"), IMAGE: ()}
+OF_SCANS = ("noise_m", "residual_m", "position_std_m", "heading_std_deg")
+BOUNDED = {SCAN: OF_SCANS, SUBMAP: OF_SCANS, IMAGE: ()}
 # however well all the rest fits
-NECESSARY = {SCAN: ("contradiction", "unexplained"), IMAGE: ()}
+NECESSARY = {SCAN: ("contradiction", "unexplained"), SUBMAP: ("contradiction", "unexplained"), IMAGE: ()}
 COMMONLY = 0.99  # of the right poses meet what is necessary
 BOUNDS_ROOM = 1.5  # by hand
 
@@ -91,7 +92,7 @@ def fit_logistic(examples: list[Example], kind: str, ridge: float = RIDGE) -> Lo
 
     Args:
         examples: all kinds; those of another kind are ignored.
-        kind: "scan" or "image".
+        kind: `SCAN`, `SUBMAP` or `IMAGE`.
         ridge: penalty on the mean of the squared weights.
 
     Raises:
@@ -129,7 +130,7 @@ def fit_decision(examples: list[Example], kind: str, threshold: float) -> tuple[
 
     Args:
         examples: all kinds; those of another kind are ignored.
-        kind: "scan" or "image".
+        kind: `SCAN`, `SUBMAP` or `IMAGE`.
         threshold: probability from which on closures are accepted.
 
     Returns:
@@ -139,7 +140,8 @@ def fit_decision(examples: list[Example], kind: str, threshold: float) -> tuple[
     odds = left_out_odds(mine, kind)
     model = fit_logistic(mine, kind)
     wrong = np.array([not (one.right or refuted(one.measurements)) for one in mine], bool)
-    safe = made_safe(model, odds[wrong], threshold)
+    own = np.array([model.odds(scores(one.measurements)) for one in mine])
+    safe = made_safe(model, np.concatenate([odds[wrong], own[wrong]]), threshold)
     return safe, odds + safe.bias - model.bias
 
 
@@ -160,7 +162,7 @@ def made_safe(model: Logistic, wrong_odds: Array, threshold: float) -> Logistic:
 
     Args:
         model: fitted to all domains.
-        wrong_odds: (N,) of wrong poses, by models that did not know their domains.
+        wrong_odds: (N,) of wrong poses, by this model and by models that did not know their domains.
         threshold: probability from which on closures are accepted.
     """
     excess = float(wrong_odds.max(initial=-np.inf)) + SAFETY - math.log(threshold / (1 - threshold))
@@ -168,7 +170,10 @@ def made_safe(model: Logistic, wrong_odds: Array, threshold: float) -> Logistic:
 
 
 def bounds_of(examples: list[Example], kind: str) -> dict[str, tuple[float, float]]:
-    """Smallest and largest values of right poses of a kind, with some margin, by the name of the number."""
+    """Smallest and largest values of right poses of a kind, with some margin, by the name of the number.
+
+    A pose may be known better than any of the examples.
+    """
     mine = [example.measurements for example in examples if example.kind == kind and example.right]
     bounds = {}
     for name in (*BOUNDED[kind], *NECESSARY[kind]):
@@ -176,7 +181,7 @@ def bounds_of(examples: list[Example], kind: str) -> dict[str, tuple[float, floa
         known = values[np.isfinite(values)]
         share = COMMONLY if name in NECESSARY[kind] else 1.0
         least, greatest = np.quantile(known, [1.0 - share, share])
-        bounds[name] = float(least / BOUNDS_ROOM), float(greatest * BOUNDS_ROOM)
+        bounds[name] = 0.0 if "_std_" in name else float(least / BOUNDS_ROOM), float(greatest * BOUNDS_ROOM)
     return bounds
 
 
@@ -203,7 +208,7 @@ def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: dict[str, s
     }
     content["models"] = {kind: asdict(model.models[kind]) for kind in CRITERIA}
     content["bounds"] = model.bounds
-    content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in (SCAN, IMAGE)}
+    content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in CRITERIA}
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 

@@ -1,4 +1,4 @@
-"""Fit the acceptance model of scans to simulated validation worlds, in all domains together."""
+"""Fit the acceptance models of scans and of submaps to simulated validation worlds, in all domains together."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, Measurements, load_acceptance, refuted
-from umf_ros.verification.hypothesis import SCAN, Hypothesis
+from umf_ros.verification.hypothesis import SCAN, SUBMAP, Hypothesis
 from umf_ros.verification.measurement import measure, runner_up
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.rerank import rerank
@@ -103,26 +103,34 @@ def kept_examples(
 
 
 def examples_of(domain: Domain, seeds: range, pairs: int, scans: Path | None, embedder: Embedder) -> Iterator[Example]:
-    """Examples from pairs of surveys: half of one place, a quarter of two, a quarter of two worlds."""
+    """Examples from pairs of surveys, of scans and then of submaps."""
     places = places_of(domain, seeds, QUICK, scans, embedder)
     rng = np.random.default_rng([seeds.start, 60])
+    verifier = Verifier(Verification())
+    for number, pair in enumerate(_mixed(places, domain, pairs, rng)):
+        view = VIEWS[number % len(VIEWS)]
+        query, match = (_seen(place.keyframe, view, domain.scanner.all_round) for place in (pair.query, pair.match))
+        yield from _examples(Tried(query, match, pair), verifier, domain, rng)
+    for pair in _mixed(places, domain, pairs, rng):
+        if pair.query.before is not None:
+            match = pair.match.around or pair.match.keyframe
+            yield from _examples(Tried(pair.query.before, match, pair), verifier, domain, rng)
+
+
+def _mixed(places: list[ScannedPlace], domain: Domain, pairs: int, rng: np.random.Generator) -> list[ScanPair]:
+    """So many pairs: half of one place, a quarter of two, a quarter of two worlds."""
     every = list(pairs_of(places, domain, rng))
     mixed = [every[index] for index in rng.permutation(len(every))]
     chosen = [pair for pair in mixed if pair.kind != ELSEWHERE][: pairs // 2]
     chosen += [pair for pair in mixed if pair.kind == ELSEWHERE][: pairs // 4]
-    chosen += [_between_worlds(places, rng) for _ in range(pairs // 4)]
-    verifier = Verifier(Verification())
-    for number, pair in enumerate(chosen):
-        view = VIEWS[number % len(VIEWS)]
-        query, match = (_seen(place.keyframe, view, domain.scanner.all_round) for place in (pair.query, pair.match))
-        yield from _examples(Tried(query, match, pair), verifier, domain, rng)
+    return chosen + [_between_worlds(places, rng) for _ in range(pairs // 4)]
 
 
 def _examples(tried: Tried, verifier: Verifier, domain: Domain, rng: np.random.Generator) -> Iterator[Example]:
     """Poses that verification finds, and its measurements at poses that it may find another time."""
     verifier.reset()
     candidates = [(Candidate(0, tried.match.stamp_ns, tried.pair.similarity), tried.match)]
-    examined = [one for one in verifier.examine(tried.query, candidates) if one.kind == SCAN]
+    examined = [one for one in verifier.examine(tried.query, candidates) if one.scans]
     found = [(one.pose, one.measurements) for one in examined]
     scans = PreparedScan.of(tried.match), PreparedScan.of(tried.query)
     if all(scan.usable for scan in scans):
@@ -257,7 +265,8 @@ def _write(console: Console, fitted: tuple[AcceptanceModel, dict[str, float]], o
     model, results = fitted
     for name, value in results.items():
         console.print(f"{name:32} {value:.4g}")
-    save_acceptance(model, out, {SCAN: f"python -m umf_ros.lab.fit.scan_acceptance {options}"}, results)
+    told = f"python -m umf_ros.lab.fit.scan_acceptance {options}"
+    save_acceptance(model, out, {SCAN: told, SUBMAP: told}, results)
     console.print(f"wrote {out}")
 
 
@@ -278,16 +287,18 @@ def _in_domain(
 
 
 def fit(examples: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
-    """The model that explains the examples, and how it does in domains left out.
+    """The models that explain the examples of scans and of submaps, and how they do in domains left out.
 
-    The shipped model's parts for other kinds than scans stay.
+    The shipped model's parts for images stay.
     """
-    shipped = load_acceptance()
-    mine = [example for example in examples if example.kind == SCAN]
-    model, odds = fit_decision(mine, SCAN, THRESHOLD)
-    bounds = shipped.bounds | {SCAN: bounds_of(mine, SCAN)}
-    fitted = replace(shipped, models=dict(shipped.models) | {SCAN: model}, bounds=bounds)
-    return fitted, _judge(SCAN, mine, odds)
+    fitted, results = load_acceptance(), dict[str, float]()
+    for kind in (SCAN, SUBMAP):
+        mine = [example for example in examples if example.kind == kind]
+        model, odds = fit_decision(mine, kind, THRESHOLD)
+        bounds = fitted.bounds | {kind: bounds_of(mine, kind)}
+        fitted = replace(fitted, models=fitted.models | {kind: model}, bounds=bounds)
+        results |= _judge(kind, mine, odds)
+    return fitted, results
 
 
 def examine(drive: SurveyedDrive, keyframes: list[Keyframe]) -> Iterator[Example]:
