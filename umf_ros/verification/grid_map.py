@@ -90,12 +90,18 @@ class GridMap:
 
     @cached_property
     def spectra(self) -> Spectra:
-        """Spectra (4, ...) of relief and structure, and of their squares."""
+        """Spectra (2, ...) of relief and structure."""
         return _spectra_of(self.layers[None])[0]
 
-    def turned_spectra(self, headings: Array) -> Spectra:
-        """Conjugated spectra (H, 4, ...) of the maps turned about the sensor by headings (H,), rad."""
-        found: Spectra = _spectra_of(np.stack([_turned(self.layers, heading) for heading in headings])).conj()
+    @cached_property
+    def squared_spectra(self) -> Spectra:
+        """Spectra (2, ...) of their squares."""
+        return _spectra_of(self.layers[None] ** 2)[0]
+
+    def turned_spectra(self, headings: Array, power: int = 1) -> Spectra:
+        """Conjugated spectra (H, 2, ...) of the maps or their squares, turned by headings (H,), rad."""
+        turned = np.stack([_turned(self.layers, heading) for heading in headings])
+        found: Spectra = _spectra_of(turned**power).conj()
         return found
 
 
@@ -176,8 +182,8 @@ def _blur(values: Grid) -> Grid:
 
 
 def _spectra_of(layers: Grid) -> Spectra:
-    """Spectra (K, 4, ...) of layers (K, side, side, 2) and of their squares."""
-    found: Spectra = scipy.fft.rfft2(np.concatenate([layers, layers**2], axis=3).transpose(0, 3, 1, 2))
+    """Spectra (K, 2, ...) of layers (K, side, side, 2)."""
+    found: Spectra = scipy.fft.rfft2(layers.transpose(0, 3, 1, 2))
     return found
 
 

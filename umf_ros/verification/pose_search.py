@@ -23,7 +23,7 @@ from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, Points
 from umf_ros.core.geometry import Array, heading, invert, make_pose, near, relative, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.grid_map import GridMap, Spectra, terrain_fit
+from umf_ros.verification.grid_map import Spectra, terrain_fit
 from umf_ros.verification.hypothesis import Hypothesis, same_pose
 from umf_ros.verification.keypoints import common_keypoints
 from umf_ros.verification.prepared_scan import PreparedScan, levelled, structured, views_decide
@@ -65,15 +65,15 @@ class RotatedMaps:
     def __init__(self, scan: PreparedScan) -> None:
         self.scan = scan
         self.map = scan.map(scan.cell_m)
-        self._spectra: dict[int, Spectra] = {}
+        self._spectra: dict[int, dict[int, Spectra]] = {1: {}, 2: {}}
 
-    def spectra(self, wanted: NDArray[np.intp]) -> Spectra:
-        """Spectra (H, 4, ...), conjugated, at the headings (H,) by index."""
-        fresh = [index for index in wanted.tolist() if index not in self._spectra]
+    def spectra(self, wanted: NDArray[np.intp], power: int = 1) -> Spectra:
+        """Spectra (H, 2, ...), conjugated, of the map or its square at the headings (H,) by index."""
+        known = self._spectra[power]
+        fresh = [index for index in wanted.tolist() if index not in known]
         if fresh:
-            made = self.map.turned_spectra(const.ALL_HEADINGS[fresh])
-            self._spectra |= dict(zip(fresh, made, strict=True))
-        return np.stack([self._spectra[index] for index in wanted.tolist()])
+            known |= dict(zip(fresh, self.map.turned_spectra(const.ALL_HEADINGS[fresh], power), strict=True))
+        return np.stack([known[index] for index in wanted.tolist()])
 
 
 def search(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
@@ -84,11 +84,12 @@ def search(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
     if not len(wanted) or min(len(theirs.rows), len(ours.rows)) < const.FEWEST_POINTS:
         return []
     fits = []
-    correlation, variance = _correlate(theirs, turned.spectra(wanted))
+    correlation, peaks = _correlate(theirs.spectra, turned.spectra(wanted), theirs.side), const.PEAKS
     if max(match.merged, turned.scan.merged) > 1:
-        variance += const.LEAST_CHANCE * variance.max(axis=(1, 2, 3), keepdims=True)
-        correlation /= np.sqrt(np.maximum(variance, 1e-12))
-    for index, shift in _peaks(correlation, wanted, const.PEAKS, ours.cell_m):
+        peaks = const.SUBMAP_PEAKS
+        variance = np.maximum(_correlate(theirs.squared_spectra, turned.spectra(wanted, 2), theirs.side), 1e-12)
+        correlation /= np.sqrt(variance + const.LEAST_CHANCE * variance.max(axis=(1, 2, 3), keepdims=True))
+    for index, shift in _peaks(correlation, wanted, peaks, ours.cell_m):
         guess = lifted(match, turned.scan, float(const.ALL_HEADINGS[index]), shift)
         fits.append(coarse_align(match, turned.scan, guess))
     return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
@@ -119,7 +120,7 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     level = levelled(match, query, pose)
     theirs, ours = match.map(query.cell_m), query.map(query.cell_m)
     turns = float(heading(level)) + np.array([0.0, np.pi])
-    correlation, _ = _correlate(theirs, ours.turned_spectra(turns))
+    correlation = _correlate(theirs.spectra, ours.turned_spectra(turns), theirs.side)
     row, column = np.round(level[:2, 3] / query.cell_m).astype(int) + const.MAP_SHIFT
     correlation[:, 0, max(row - 1, 0) : max(row + 2, 0), max(column - 1, 0) : max(column + 2, 0)] = -np.inf
     found = []
@@ -133,14 +134,14 @@ def _by_scouts(match: PreparedScan, query: PreparedScan, guess: Array) -> Array:
     return run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M)
 
 
-def _correlate(around: GridMap, turned: Spectra) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Correlation (2, H, shifts, shifts) of the relief, and of relief and structure; its variance by chance."""
-    products = around.spectra * turned
-    products[:, 1::2] += products[:, ::2]
+def _correlate(around: Spectra, turned: Spectra, side: int) -> NDArray[np.float32]:
+    """Correlation (2, H, shifts, shifts) of the relief, and of relief and structure together."""
+    products = around * turned
+    products[:, 1] += products[:, 0]
     window = np.arange(-const.MAP_SHIFT, const.MAP_SHIFT + 1)
     rows = scipy.fft.ifft(products, axis=-2)[..., window, :]
-    found: NDArray[np.float32] = scipy.fft.irfft(rows, around.side, axis=-1)[..., window].swapaxes(0, 1)
-    return found[:2], np.maximum(found[2:], 0.0)
+    found: NDArray[np.float32] = scipy.fft.irfft(rows, side, axis=-1)[..., window].swapaxes(0, 1)
+    return found
 
 
 def _peaks(

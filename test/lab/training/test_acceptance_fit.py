@@ -17,8 +17,9 @@ from umf_ros.lab.fit.acceptance import (
     inside_ellipsoid,
     scale_covariance,
 )
-from umf_ros.verification.acceptance import scores
-from umf_ros.verification.hypothesis import SCAN
+from umf_ros.lab.fit.scan_acceptance import fit
+from umf_ros.verification.acceptance import load_acceptance, scores
+from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP
 from umf_ros.verification.scan_alignment import CovarianceModel, covariance_of
 
 
@@ -139,3 +140,22 @@ def test_examples_of_another_kind_are_left_aside() -> None:
     found = examples(100, rng)
     others = [Example(BAD_VIEWS, True)] * 50
     assert fit_logistic(found + others, SCAN) == fit_logistic(found, SCAN)
+
+
+def test_no_wrong_example_is_accepted_by_the_decision_itself() -> None:
+    """A wrong pose that other domains find improbable, and that its own domain makes probable."""
+    rng = np.random.default_rng(3)
+    known = in_domains(rng)
+    decision, _ = fit_decision(known, SCAN, 0.9)
+    odds = [decision.odds(scores(example.measurements)) for example in known if not example.right]
+    assert max(odds) < np.log(9)
+
+
+def test_scans_and_submaps_are_fitted_apart() -> None:
+    rng = np.random.default_rng(4)
+    scans = examples(120, rng)
+    submaps = [replace(one, measurements=one.measurements | {"merged": 9.0}) for one in examples(120, rng)]
+    model, results = fit([replace(one, domain=str(number % 3)) for number, one in enumerate(scans + submaps)])
+    assert model.models[SCAN] != model.models[SUBMAP] and model.models[IMAGE] == load_acceptance().models[IMAGE]
+    assert "common_view" not in model.models[SUBMAP].weights
+    assert results["scan_examples"] == results["submap_examples"] == 120
