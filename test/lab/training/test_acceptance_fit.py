@@ -142,13 +142,19 @@ def test_examples_of_another_kind_are_left_aside() -> None:
     assert fit_logistic(found + others, SCAN) == fit_logistic(found, SCAN)
 
 
+def bad(*names: str) -> dict[str, float]:
+    return {name: BAD[name] for name in names}
+
+
 def test_no_wrong_example_is_accepted_by_the_decision_itself() -> None:
-    """A wrong pose that other domains find improbable, and that its own domain makes probable."""
-    rng = np.random.default_rng(3)
-    known = in_domains(rng)
+    """Other domains find a wrong pose improbable whose own domain makes it probable."""
+    standing, rest = ("upright_counterparts", "unexplained", "terrain_score"), ("position_std_m", "heading_std_deg")
+    known = [Example(GOOD | bad(*names), not names, name) for name in "abc" for names in ((), standing + rest)]
+    odd = GOOD | bad(*rest)
+    known += [Example(odd, True, "odd")] * 50 + [Example(GOOD | bad(*standing), False, "odd")] * 49
+    known.append(Example(odd, False, "odd"))
     decision, _ = fit_decision(known, SCAN, 0.9)
-    odds = [decision.odds(scores(example.measurements)) for example in known if not example.right]
-    assert max(odds) < np.log(9)
+    assert max(decision.odds(scores(one.measurements)) for one in known if not one.right) < np.log(9)
 
 
 def test_scans_and_submaps_are_fitted_apart() -> None:
