@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
+from subprocess import PIPE, Popen
 from types import SimpleNamespace
 
 import numpy as np
@@ -147,12 +149,16 @@ def test_a_line_of_diagnostics_is_text_for_any_value() -> None:
 
 
 def test_memory_is_what_is_resident_now() -> None:
-    before = memory_mb()
-    block = np.ones(100 * 2**20, np.uint8)
-    grown = memory_mb() - before
-    assert block.nbytes == 100 * 2**20 and 80 < grown < 200
-    del block
-    assert memory_mb() - before < 50
+    """Of a process of its own: in this one, pages of other tests come and go."""
+    script = "block = b'x' * (100 * 2**20); print(flush=True); input(); del block; print(flush=True); input()"
+    with Popen([sys.executable, "-c", script], stdin=PIPE, stdout=PIPE, text=True) as child:
+        assert child.stdin is not None and child.stdout is not None
+        resident = []
+        for _ in range(2):
+            child.stdout.readline()
+            resident.append(memory_mb(child.pid))
+            print(file=child.stdin, flush=True)
+    assert 100 < resident[0] < 150 and resident[1] < 50
 
 
 @pytest.mark.parametrize(
