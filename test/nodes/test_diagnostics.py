@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from subprocess import PIPE, Popen
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from processes import wait_until
