@@ -26,7 +26,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import Spectra, terrain_fit
 from umf_ros.verification.hypothesis import Hypothesis, same_pose
 from umf_ros.verification.keypoints import common_keypoints
-from umf_ros.verification.prepared_scan import PreparedScan, levelled, structured, views_decide
+from umf_ros.verification.prepared_scan import PreparedScan, levelled, structured, submaps, views_decide
 from umf_ros.verification.scan_alignment import run_gicp
 from umf_ros.verification.view_alignment import PairedViews
 from umf_ros.verification.visibility import visible
@@ -85,7 +85,7 @@ def search(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
         return []
     fits = []
     correlation, peaks = _correlate(theirs.spectra, turned.spectra(wanted), theirs.side), const.PEAKS
-    if max(match.merged, turned.scan.merged) > 1:
+    if submaps(match, turned.scan):
         peaks = const.SUBMAP_PEAKS
         variance = np.maximum(_correlate(theirs.squared_spectra, turned.spectra(wanted, 2), theirs.side), 1e-12)
         correlation /= np.sqrt(variance + const.LEAST_CHANCE * variance.max(axis=(1, 2, 3), keepdims=True))
@@ -205,7 +205,7 @@ def find_hypotheses(
         if turned is None or not match.usable or views is not None:
             return []
     fits = search(match, turned)
-    if guess is None and max(match.merged, turned.scan.merged) > 1:
+    if guess is None and submaps(match, turned.scan):
         count, turn, shift = common_keypoints(turned.scan.keypoints, match.keypoints)
         guess = lifted(match, turned.scan, turn, shift) if count else None
     if guess is not None and (fit := coarse_align(match, turned.scan, guess)).telling:

@@ -338,6 +338,11 @@ def structured(match: PreparedScan, query: PreparedScan) -> bool:
     return all(scan.map(query.cell_m).structured for scan in (match, query))
 
 
+def submaps(match: PreparedScan, query: PreparedScan) -> bool:
+    """Whether one of two scans at least is merged of several."""
+    return max(match.merged, query.merged) > 1
+
+
 def common_blur(match: PreparedScan, query: PreparedScan) -> float:
     """How far points of two scans may be off together because a LiDAR moved, m."""
     return max(match.blur_m, query.blur_m)

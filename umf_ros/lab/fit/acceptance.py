@@ -75,8 +75,9 @@ def load_examples(path: Path) -> list[Example]:
 RIDGE = 0.03  # measured: leaving domains out, a tenth of it accepts less at no wrong one
 SAFETY = 0.25  # by hand: log-odds between the most probable wrong pose and the threshold
 # numbers that describe the scans rather than how well they fit; beyond the fitted range their meaning is unknown
-OF_SCANS = ("noise_m", "residual_m", "position_std_m", "heading_std_deg")
-BOUNDED = {SCAN: OF_SCANS, SUBMAP: OF_SCANS, IMAGE: ()}
+DEVIATIONS = ("position_std_m", "heading_std_deg")
+_OF_SCANS = ("noise_m", "residual_m", *DEVIATIONS)
+BOUNDED = {SCAN: _OF_SCANS, SUBMAP: _OF_SCANS, IMAGE: ()}
 # however well all the rest fits
 NECESSARY = {SCAN: ("contradiction", "unexplained"), SUBMAP: ("contradiction", "unexplained"), IMAGE: ()}
 COMMONLY = 0.99  # of the right poses meet what is necessary
@@ -181,7 +182,7 @@ def bounds_of(examples: list[Example], kind: str) -> dict[str, tuple[float, floa
         known = values[np.isfinite(values)]
         share = COMMONLY if name in NECESSARY[kind] else 1.0
         least, greatest = np.quantile(known, [1.0 - share, share])
-        bounds[name] = 0.0 if "_std_" in name else float(least / BOUNDS_ROOM), float(greatest * BOUNDS_ROOM)
+        bounds[name] = 0.0 if name in DEVIATIONS else float(least / BOUNDS_ROOM), float(greatest * BOUNDS_ROOM)
     return bounds
 
 
