@@ -13,7 +13,6 @@ from umf_ros.places.database import PlaceDatabase
 from umf_ros.submaps.history import SubmapHistory, can_be_merged
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
-from umf_ros.verification.keypoints import most_alike
 from umf_ros.verification.verifier import NO_GUESSES
 
 Places = list[tuple[Candidate, Array]]
@@ -190,14 +189,13 @@ class SubmapFinder:
     def _look_alike(self, query: Keyframe) -> list[int]:
         """Rows of the database whose submaps share most keypoints with that of a keyframe, or with its scan."""
         submap = self.history.before(query) or query
-        rows = np.array(list(self.history.keypoints), np.intp)
-        rows = rows[self._database.admissible(query, self._rules, self._sessions, rows)]
+        rows = np.array(self.history.keypoints.rows, np.intp)
         keys = self._database.store.keys[rows]
         # scans that both submaps hold are alike for no other reason
         first_m = query.path_length_m - 2 * const.ODOMETRY_REACH_M
         apart = (keys["session"] != query.session) | (keys["travelled_m"] < first_m)
-        described = {row: self.history.keypoints[row] for row in rows[apart].tolist()}
-        return most_alike(self._verifier.scans[submap].keypoints, described)[: const.LOOKALIKES]
+        apart &= self._database.admissible(query, self._rules, self._sessions, rows)
+        return self.history.keypoints.most_alike(self._verifier.scans[submap].keypoints, apart)[: const.LOOKALIKES]
 
 
 def _joined(first: list[Hypothesis], others: Sequence[Hypothesis]) -> list[Hypothesis]:

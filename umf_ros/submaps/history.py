@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from umf_ros.core.frames import Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, cubes, first_of_cubes, heading, relative, transform
 from umf_ros.places.store import KeyframeStore
+from umf_ros.submaps.lookalikes import KeypointIndex
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import align_scans
@@ -169,7 +170,7 @@ class SubmapHistory:
 
     Attributes:
         needed: whether single scans of this session show too little of a place.
-        keypoints: of submaps by the row of their keyframe, of every third metre; those of a stored file are read.
+        keypoints: of submaps, of every third metre; those of a stored file are read.
     """
 
     def __init__(self, store: KeyframeStore) -> None:
@@ -177,8 +178,8 @@ class SubmapHistory:
         self._odometry: dict[int, Array] = {}
         self._drifts: dict[int, DriftMeter] = {}
         self._submaps: OrderedDict[tuple[int, int], Keyframe] = OrderedDict()
-        self.keypoints = store.keypoints()
-        self._described = set(self.keypoints)
+        self.keypoints = KeypointIndex(store.keypoints())
+        self._described = set(self.keypoints.rows)
         self.reset()
 
     def reset(self) -> None:
@@ -211,8 +212,9 @@ class SubmapHistory:
         for row in [one for one in rows if one not in self._described][:most]:
             self._described.add(row)
             if (submap := self.around(row)) is not None:
-                self.keypoints[row] = PreparedScan.of(submap).keypoints
-                self.store.add_keypoints(row, self.keypoints[row])
+                keypoints = PreparedScan.of(submap).keypoints
+                self.keypoints.add(row, keypoints)
+                self.store.add_keypoints(row, keypoints)
 
     def rows(self, session: int, first_m: float, last_m: float) -> Rows:
         """Rows of the database on a part of a session's path, in its order, one of every 1.5 m."""

@@ -1,9 +1,8 @@
-"""Keypoints of the relief of submaps: which submaps look alike from above, whatever the heading, and their pose."""
+"""Keypoints of the relief of submaps, whatever the heading, and the pose that two submaps share by theirs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -13,6 +12,8 @@ from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 from umf_ros.verification.rerank import mutual_neighbours
 
+DESCRIPTOR = 128
+"""Numbers of the descriptor of a keypoint."""
 Keypoints = NDArray[np.float32]
 """(K, 130), strongest first: x and y in m in the upright body frame, and a unit vector that no heading changes."""
 
@@ -26,7 +27,7 @@ def find_keypoints(relief: NDArray[np.float32]) -> Keypoints:
     detector = cv2.SIFT.create(const.KEYPOINTS, 3, const.KEYPOINT_CONTRAST, 20, 1.0)
     found, descriptors = detector.detectAndCompute(picture, inner)
     if descriptors is None:
-        return np.empty((0, 130), np.float32)
+        return np.empty((0, 2 + DESCRIPTOR), np.float32)
     order = np.argsort([-one.response for one in found], kind="stable")[: const.KEYPOINTS]
     pixels = np.array([found[i].pt[::-1] for i in order])
     places = (pixels + 0.5 - np.array(relief.shape) / 2) * const.TERRAIN_CELL_M
@@ -50,28 +51,3 @@ def common_keypoints(query: Keypoints, match: Keypoints) -> tuple[int, float, Ar
     if motion is None or abs(float(np.hypot(motion[0, 0], motion[1, 0])) - 1) > const.KEYPOINT_SCALE:
         return nothing
     return int(inliers.sum()), math.atan2(motion[1, 0], motion[0, 0]), np.asarray(motion[:, 2], float)
-
-
-def most_alike(query: Keypoints, submaps: Mapping[int, Keypoints]) -> list[int]:
-    """Names of the submaps that share most keypoints with the query's, best first; its keypoints vote for some."""
-    if len(query) < const.MIN_KEYPOINTS or not submaps:
-        return []
-    names, votes = list(submaps), _votes(query, list(submaps.values()))
-    chosen = [names[one] for one in np.argsort(-votes, kind="stable")[: const.SUBMAPS_COMPARED] if votes[one] > 0]
-    counts = {name: common_keypoints(query, submaps[name])[0] for name in chosen}
-    return [name for name in sorted(counts, key=lambda name: -counts[name]) if counts[name]]
-
-
-def _votes(query: Keypoints, submaps: list[Keypoints]) -> NDArray[np.float32]:
-    """(S,) for every submap: by how much its keypoints are more like the query's than most others'."""
-    similarity = query[:, 2:] @ np.concatenate(submaps)[:, 2:].T
-    owner = np.repeat(np.arange(len(submaps)), [len(one) for one in submaps])
-    if not len(owner):  # ground on which nothing stands out
-        return np.zeros(len(submaps), np.float32)
-    kept = min(const.KEYPOINT_VOTES, similarity.shape[1] - 1)
-    best = np.argpartition(-similarity, kept, axis=1)[:, : kept + 1]
-    value = np.take_along_axis(similarity, best, axis=1)
-    votes = np.zeros((len(query), len(submaps)), np.float32)
-    np.maximum.at(votes, (np.arange(len(votes))[:, None], owner[best]), value - value.min(axis=1, keepdims=True))
-    total: NDArray[np.float32] = votes.sum(axis=0)
-    return total

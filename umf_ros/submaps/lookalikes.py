@@ -1,0 +1,79 @@
+"""Index of the keypoints of submaps: which of them look alike from above."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from umf_ros.core.geometry import Array
+from umf_ros.places.database import one_thread
+from umf_ros.verification import constants as const
+from umf_ros.verification.keypoints import DESCRIPTOR, Keypoints, common_keypoints
+
+
+class KeypointIndex:
+    """Growing index of the keypoints of submaps, in half precision.
+
+    Args:
+        submaps: keypoints by the row of their keyframe in the database.
+
+    Attributes:
+        rows: of the keyframes, in the order of their addition.
+    """
+
+    def __init__(self, submaps: Mapping[int, Keypoints]) -> None:
+        with one_thread() as faiss:
+            half = faiss.ScalarQuantizer.QT_fp16
+            self._index = faiss.IndexScalarQuantizer(DESCRIPTOR, half, faiss.METRIC_INNER_PRODUCT)
+        self.rows: list[int] = []
+        self._firsts = [0]
+        self._positions: list[Array] = []
+        for row, keypoints in submaps.items():
+            self.add(row, keypoints)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def add(self, row: int, keypoints: Keypoints) -> None:
+        """Add the keypoints (K, 130) of a submap."""
+        with one_thread():
+            self._index.add(np.ascontiguousarray(keypoints[:, 2:]))
+        self.rows.append(row)
+        self._firsts.append(self._index.ntotal)
+        self._positions.append(keypoints[:, :2].copy())
+
+    def most_alike(self, query: Keypoints, admissible: NDArray[np.bool_]) -> list[int]:
+        """Return the rows of the submaps that share most keypoints with a query, best first.
+
+        Every keypoint of the query votes for the submaps with the keypoints most similar to it, by how much they exceed
+        the next ones. The submaps with most votes are compared by the positions of their keypoints too.
+
+        Args:
+            query: (K, 130).
+            admissible: (S,) whether a submap may be returned, in the order of `rows`.
+        """
+        votes = self._votes(query, admissible)
+        chosen = [one for one in np.argsort(-votes, kind="stable")[: const.SUBMAPS_COMPARED] if votes[one] > 0]
+        counts = {self.rows[one]: common_keypoints(query, self._keypoints(one))[0] for one in chosen}
+        return [row for row in sorted(counts, key=lambda row: -counts[row]) if counts[row]]
+
+    def _keypoints(self, number: int) -> Keypoints:
+        first, last = self._firsts[number : number + 2]
+        found: Keypoints = np.hstack([self._positions[number], self._index.reconstruct_n(first, last - first)])
+        return found
+
+    def _votes(self, query: Keypoints, admissible: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """(S,) for every submap: by how much its keypoints are more like the query's than most others'."""
+        known = np.repeat(admissible, np.diff(self._firsts))
+        kept, votes = min(const.KEYPOINT_VOTES, int(known.sum()) - 1), np.zeros((len(query), len(self)), np.float32)
+        if len(query) >= const.MIN_KEYPOINTS and kept > 0:
+            with one_thread() as faiss:
+                selector = faiss.IDSelectorBitmap(np.packbits(known, bitorder="little"))
+                rules = faiss.SearchParameters(sel=selector)
+                value, found = self._index.search(np.ascontiguousarray(query[:, 2:]), kept + 1, params=rules)
+            owner = np.searchsorted(self._firsts, found, side="right") - 1
+            np.maximum.at(votes, (np.arange(len(votes))[:, None], owner), value - value.min(axis=1, keepdims=True))
+        total: NDArray[np.float32] = votes.sum(axis=0)
+        return total
