@@ -160,8 +160,11 @@ def test_a_closure_before_its_odometry_is_pending() -> None:
     (verdict,) = rover.localizer.add_closure(ahead)
     assert verdict.state is State.PENDING and rover.localizer.verdict_counts()[State.PENDING] == pending + 1
     assert rover.localizer.reasons[ClosureReason.AGREES_WITH_POSE] == known
+    assert rover.localizer.update() == []
     rover.drive(0.25)
     assert rover.localizer.reasons[ClosureReason.AGREES_WITH_POSE] == known + 1
+    assert [(one.closure, one.state) for one in rover.localizer.update()] == [(ahead, State.ACCEPTED)]
+    assert rover.localizer.update() == []
 
 
 @pytest.mark.parametrize("kind", ["unknown match", "before all odometry", "broken pose"])

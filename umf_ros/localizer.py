@@ -112,6 +112,7 @@ class Localizer(PoseGraph):
         self._path: list[Localization] = []
         self.relocalised = 0
         self.reasons: Counter[ClosureReason] = Counter()
+        self._decided: list[ClosureVerdict] = []
         self.begin_session()
 
     def begin_session(self) -> None:
@@ -136,7 +137,8 @@ class Localizer(PoseGraph):
             path_m = last.path_m + float(self._noise.path_lengths(last.pose[None], odom_T_body[None], np.zeros(1))[0])
         self._samples.append(_Sample(stamp_ns, np.asarray(odom_T_body, float), path_m))
         for _ in range(len(self._early)):
-            self.add_closure(self._early.popleft())
+            decided = self.add_closure(self._early.popleft())
+            self._decided += [verdict for verdict in decided if verdict.reason is not ClosureReason.NO_ODOMETRY_YET]
         found = self.estimate()
         if found is not None:
             before = self._path[-1].map_T_body[:3, 3] if self._path else np.full(3, np.inf)
@@ -156,6 +158,11 @@ class Localizer(PoseGraph):
         reason = self._judge(closure)
         self.reasons[reason] += 1
         return [ClosureVerdict(closure, _STATES[reason], reason)]
+
+    def update(self, exactly: bool = True) -> list[ClosureVerdict]:
+        """Return the verdicts on closures whose odometry has arrived since the last call."""
+        decided, self._decided = self._decided, []
+        return decided
 
     def estimate(self) -> Localization | None:
         """Return the pose at the newest odometry; None while it is unknown."""
