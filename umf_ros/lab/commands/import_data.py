@@ -31,7 +31,8 @@ def command(
     from rich.console import Console
     from rich.progress import Progress
 
-    from umf_ros.lab.importing import FORMATS, write_recording
+    from umf_ros.lab.imported import write_recording
+    from umf_ros.lab.importing import FORMATS
 
     console = Console()
     found = FORMATS[kind](source)

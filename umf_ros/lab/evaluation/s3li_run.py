@@ -49,7 +49,8 @@ from umf_ros.lab.datasets.simulated import course, poses_of
 from umf_ros.lab.evaluation.bag_run import sequence_set
 from umf_ros.lab.evaluation.results import TextTable
 from umf_ros.lab.evaluation.retrieval import THESIS_RULE, Mask, loop_closure, rank
-from umf_ros.lab.importing import FORMATS, write_recording
+from umf_ros.lab.imported import write_recording
+from umf_ros.lab.importing import FORMATS
 from umf_ros.lab.simulation.twin_files import LEAST_OVERLAP, view_overlap
 from umf_ros.replay import Replay
 from umf_ros.runs.findings import look_first
