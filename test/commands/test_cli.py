@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -68,6 +69,14 @@ def test_every_command_explains_itself_and_its_options(words: list[str]) -> None
     assert ended.status == 0 and ended.err == ""
     assert f"Usage: umf {' '.join(words)} " in ended.text and len(ended.text) > 150
     assert umf(*words, "-h").out == ended.out
+
+
+@pytest.mark.parametrize("words", [["replay"], ["evaluate"], ["map", "make"], ["pretrain", "image"]])
+def test_paragraphs_of_the_help_fill_their_lines(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    prose = umf(*words, "--help").out.partition("╭")[0].splitlines()
+    for line, after in pairwise(line.strip() for line in prose):
+        assert not line or not after or len(f"{line} {after.split()[0]}") > 78, line
 
 
 def test_without_a_command_the_help_is_shown() -> None:
