@@ -169,7 +169,7 @@ def test_ctrl_c_keeps_the_results_so_far(mini_bag: Path, mini_config: Path, tmp_
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGINT)
     output, _ = process.communicate(timeout=120)
-    assert process.returncode == 0 and "Interrupted" in output and "Traceback" not in output
+    assert process.returncode == 130 and "Interrupted" in output and "Traceback" not in output
     assert [name for name in FILES if not (tmp_path / "latest" / name).is_file()] == []
     summary = json.loads((tmp_path / "latest" / "summary.json").read_text())
     assert summary["keyframes"] == len(keyframes.read_text().splitlines()) - 1

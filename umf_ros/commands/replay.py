@@ -50,8 +50,8 @@ def command(
     """Find loop closures in a recording as fast as the machine goes.
 
     Needs no ROS. Writes closures, trajectories, the pose graph and a report to a new folder.
-    Ctrl-C ends the run early and keeps its results; --resume continues it, also after a crash. Exit status 3: the
-    inputs could not give any result.
+    Ctrl-C ends the run early and keeps its results, with exit status 130; --resume continues it, also after a crash.
+    Exit status 3: the inputs could not give any result.
     """
     options.check_files(bag, config, odometry, ground_truth)
     options.check_map(map_folder)
@@ -126,7 +126,7 @@ def command(
             recording,
             inputs=input_counts(reader.counters),
             warnings=warnings,
-            interrupted=interrupted(),
+            interrupted=bool(interrupted()),
             odometry_file={"path": str(odometry.resolve()), "frame": odometry_frame} if odometry else None,
         )
         if settings.localizing:
@@ -139,7 +139,7 @@ def command(
             run = read_run(folder, recording, truth)
             status = finish_run(run, recording, console, sensors, frozenset(warnings + absent)).exit_code
     replay.raise_if_frames_failed()
-    raise typer.Exit(status)
+    raise typer.Exit(128 + interrupted() if interrupted() else status)
 
 
 def _tell_inputs(console: Console, settings: Settings) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +23,8 @@ def command(
 ) -> None:
     """Simulate a short traverse, play it to the live nodes over DDS, and write a report.
 
-    Bag player, loop_closure_node and pose_graph_node run as separate processes, as next to a rover.
+    Bag player, loop_closure_node and pose_graph_node run as separate processes, as next to a rover. Ctrl-C ends them
+    early and keeps the results, with exit status 130. Exit status 3: the inputs could not give any result.
     """
     from rich.console import Console
 
@@ -44,8 +46,9 @@ def command(
     with LiveGraph(folder, console) as graph:
         graph.play(bag, recording.duration_s, rate)
     with undisturbed():
-        remember_recording(folder, recording)
-        report_run(folder, recording, console)
+        remember_recording(folder, recording, interrupted=graph.interrupted)
+        status = report_run(folder, recording, console).exit_code
+    raise typer.Exit(128 + signal.SIGINT if graph.interrupted else status)
 
 
 def play(

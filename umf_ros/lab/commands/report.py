@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from umf_ros.bags.reader import Bag
     from umf_ros.runs.diagnosis import ClosureDiagnosis
+    from umf_ros.runs.findings import RunVerdict
     from umf_ros.runs.truth import JudgedRun
 
 SHOWN = 8
@@ -43,8 +44,10 @@ def command(
     report_run(folder, open_bag(bag), Console(), ground_truth)
 
 
-def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | None = None) -> None:
-    """Evaluate a run and write its report; read the recording again for the ground truth and the sensor check.
+def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | None = None) -> RunVerdict:
+    """Evaluate a run, write its report and return the verdict.
+
+    The recording is read again for the ground truth and the sensor check.
 
     Raises:
         UmfError: the run was made on another recording; nothing is written.
@@ -60,7 +63,7 @@ def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | No
         odometry = read_odometry(named["path"], named["frame"], run.settings)
     with console.status("Checking the sensors"):
         sensors = check_sensors(bag, run.settings, odometry, run.odometry)
-    finish_run(run, bag, console, sensors)
+    return finish_run(run, bag, console, sensors)
 
 
 def why(
