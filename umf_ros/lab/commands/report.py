@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 SHOWN = 8
 """Candidates and criteria in the terminal."""
+NEAR_NS = 10**9
+"""A moment so much before the first or after the last keyframe is theirs."""
 
 
 def command(
@@ -95,7 +97,13 @@ def why(
     about = judge(read_run(folder, recording, truth), recording, keep=False)
     if not len(about.run.keyframes):
         raise UmfError(f"{folder} holds no keyframe")
-    asked_ns = _stamp(moment, int(about.run.stamps[0]))
+    first_ns, last_ns = int(about.run.stamps[0]), int(about.run.stamps[-1])
+    asked_ns = _stamp(moment, first_ns)
+    if not first_ns - NEAR_NS <= asked_ns <= last_ns + NEAR_NS:
+        seconds = (last_ns - first_ns) * 1e-9
+        raise UmfError(
+            f"{moment} is outside of {folder}: its keyframes are at 0 to {seconds:.1f} s, {first_ns} to {last_ns} ns"
+        )
     row = min(range(len(about.run.stamps)), key=lambda row: abs(int(about.run.stamps[row]) - asked_ns))
     _tell(Console(), about, row, explain(about, row))
 
