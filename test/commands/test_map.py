@@ -13,7 +13,7 @@ import pytest
 import rasterio
 import yaml
 from command_line import Ended, only_line, umf
-from recordings import part_of
+from recordings import part_of, traverse, write_mcap
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
@@ -88,6 +88,8 @@ def wrong_calls(tmp_path: Path) -> Iterator[tuple[list[Path], str]]:
     yield [tmp_path / "empty"], "holds no recording"
     (tmp_path / "notes.txt").write_text("these are notes\n")
     yield [tmp_path / "notes.txt"], "notes.txt is not a recording"
+    small = write_mcap(tmp_path / "small.mcap", traverse(0.3))
+    yield [small, tmp_path / "notes.txt"], "notes.txt is not a recording"
 
 
 def test_what_a_user_gets_wrong_is_one_line(tmp_path: Path) -> None:
