@@ -40,7 +40,7 @@ def command(
     check_writable(out)
     if bag is None:
         bag = Path("data") / f"demo_seed{seed}.mcap"
-        simulate.command(bag, preset="demo", seed=seed, duration=duration)
+        simulate.write_drive(bag, console, "demo", (seed, None), duration)
     recording = open_bag(bag)
     folder = create_run_folder(out)
     with LiveGraph(folder, console) as graph:

@@ -458,7 +458,7 @@ def sensors(
     if bag is None:
         bag = Path("data") / f"sensors_seed{seed}.mcap"
         if not bag.exists():
-            simulate.command(bag, preset="sensors", seed=seed)
+            simulate.write_drive(bag, console, "sensors", (seed, None))
     stretches = stretches_of(bag)
     recording = open_bag(bag)
     told = [one.line for one in about_sensors(check_sensors(recording, settings_for(recording, config, "auto")))]

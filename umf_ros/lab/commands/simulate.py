@@ -67,10 +67,13 @@ def command(
 ) -> None:
     """Simulate a rover with S3LI's sensors: stereo, LiDAR, IMU, odometry, GNSS and ground truth.
 
-    Also writes OUT.odometry.tum and OUT.pos, like those of S3LI. The same seed gives the same bytes.
+    Also writes OUT.odometry.tum and OUT.pos, like those of S3LI; existing files are refused. The same seed gives the
+    same bytes.
     `umf simulate s3li-twin --out DIR` writes all fourteen sequences of S3LI as published files.
     """
     from rich.console import Console
+
+    from umf_ros.core.io import check_absent
 
     console = Console()
     if str(out) == TWIN:
@@ -83,7 +86,8 @@ def command(
         else:
             _spread_shards(shards, worlds, every, sequences, workers, ray, console)
     elif out is not None:
-        _write_bag(out, preset, (seed, world), duration, family, aliasing, image_rate, truth, workers, console)
+        check_absent(out, out.with_suffix(".odometry.tum"), out.with_suffix(".pos"))
+        write_drive(out, console, preset, (seed, world), duration, family, aliasing, image_rate, truth, workers)
     else:
         raise ConfigError("say where to write: OUT.mcap, --shards DIR or --contact-sheet OUT.png")
 
@@ -117,18 +121,19 @@ def _write_twin(
     console.print(told, markup=False, highlight=False, soft_wrap=True)
 
 
-def _write_bag(
+def write_drive(
     out: Path,
+    console: Console,
     preset: str,
     seeds: tuple[int, int | None],
-    duration: float | None,
-    family: str | None,
-    aliasing: float | None,
-    image_rate: float | None,
-    truth: bool,
-    workers: int,
-    console: Console,
+    duration: float | None = None,
+    family: str | None = None,
+    aliasing: float | None = None,
+    image_rate: float | None = None,
+    truth: bool = False,
+    workers: int = 2,
 ) -> None:
+    """Write a drive and its side files, which replace earlier ones; `seeds` are those of the drive and of the world."""
     from umf_ros.lab.simulation.bag_writer import BagWriter
     from umf_ros.lab.simulation.presets import find_preset
     from umf_ros.lab.simulation.simulator import Simulator, record, write_side_files
