@@ -118,6 +118,8 @@ def test_a_rover_finds_itself_in_the_map_which_stays_as_it_is(
     assert len(rows) == about["located"] and all(float(row["probability"]) > 0.99 for row in rows)
     assert all(0 < float(row["sigma_x_m"]) < 1 for row in rows)
     assert {path: path.read_bytes() for path in before} == before
+    told = only_line(umf("replay", again, "--map", out, "--out", tmp_path / "none", "--resume"))
+    assert told == "a localising run has no use for --resume" and not (tmp_path / "none").exists()
 
 
 def test_the_map_is_a_point_cloud_too(made: tuple[Path, Ended]) -> None:

@@ -131,6 +131,9 @@ def edit(
     from umf_ros.maps.map_folder import MapFolder
     from umf_ros.maps.outputs import write_results
 
+    decided = [pair for pair in (reject, accept, undo) if pair]
+    if len(set(decided)) < len(decided):
+        raise ConfigError("--reject, --accept and --undo are given for the same closure: leave one of them")
     target = MapFolder.open(map_folder)
     edits = target.edits()
     edits |= {pair: state for pair, state in ((reject, State.REJECTED), (accept, State.ACCEPTED)) if pair}

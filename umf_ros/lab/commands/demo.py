@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from umf_ros.commands.recordings import BagPath, check_files
+from umf_ros.commands.recordings import BagPath, check_files, refuse_unused
 from umf_ros.core.errors import UmfError
 
 
@@ -26,6 +26,9 @@ def command(
     Bag player, loop_closure_node and pose_graph_node run as separate processes, as next to a rover. Ctrl-C ends them
     early and keeps the results, with exit status 130. Exit status 3: the inputs could not give any result.
     """
+    if bag is not None:
+        refuse_unused("a recording", {"--seed": seed != 1, "--duration": duration is not None})
+
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag

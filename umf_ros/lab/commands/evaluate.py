@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,6 +21,7 @@ from umf_ros.commands.recordings import (
     check_odometry_options,
     open_frames,
     open_recording,
+    refuse_unused,
 )
 from umf_ros.core.errors import ConfigError
 from umf_ros.embedding import choices
@@ -273,19 +274,19 @@ def command(
     of_recordings |= {"--odometry": odometry, "--ground-truth": ground_truth}
     every = EveryMethod(weights, trained, quick, out) if methods == "all" else None
     if data is None:
-        _refuse("simulated worlds", of_lists | of_recordings)
+        refuse_unused("simulated worlds", of_lists | of_recordings)
         chosen = str(worlds), seed, count
         figures = every.worlds(*chosen) if every else _on_worlds(*chosen, quick, weights, out)
     elif listed and lists_place_sets(data):
         allowed = () if every else ("--embedder", "--config")
         others = {name: value for name, value in of_recordings.items() if name not in allowed}
-        _refuse("a list of place sets", of_worlds | of_lists | others)
+        refuse_unused("a list of place sets", of_worlds | of_lists | others)
         figures = every.places(data) if every else _on_places(data, config, embedder, weights, out)
     elif listed:
-        _refuse("a list of sequences", of_worlds | of_recordings)
+        refuse_unused("a list of sequences", of_worlds | of_recordings)
         figures = every.sequences(data, rule) if every else _on_sequences(data, rule, weights, out)
     else:
-        _refuse("a recording", of_worlds | of_lists | ({"--embedder": embedder} if every else {}))
+        refuse_unused("a recording", of_worlds | of_lists | ({"--embedder": embedder} if every else {}))
         opened = RecordingOptions(data, config, dataset, embedder, odometry, odometry_frame, ground_truth)
         figures = every.recording(opened) if every else _on_recording(opened, weights, out)
     if json_file is not None:
@@ -304,13 +305,6 @@ def _check(data: Path | None, worlds: str | None, methods: str, trained: Path | 
         raise ConfigError(f"--methods: expected umf or all, not {methods!r}")
     if trained is not None and methods == "umf":
         raise ConfigError("--trained names weights of other methods, and without --methods all there are none")
-
-
-def _refuse(data: str, options: Mapping[str, object]) -> None:
-    """Refuse options that would be ignored."""
-    given = [name for name, value in options.items() if value]
-    if given:
-        raise ConfigError(f"{data} {'has' if data.startswith('a ') else 'have'} no use for {', '.join(given)}")
 
 
 def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Path | None, out: Path) -> Figures:
@@ -437,6 +431,7 @@ def sensors(
     images are black. Takes some minutes.
     """
     if bag is not None:
+        refuse_unused("a recording", {"--seed": seed != 1})
         check_files(bag, config)
 
     import json
