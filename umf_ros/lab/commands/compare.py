@@ -79,6 +79,7 @@ def command(
         config,
         dataset,
         warn=lambda text: errors.print(text, **WARNING),
+        method=settings.embedding.method,
     )
     views.expect(view for pair in asked for view in pair)
     comparer = Comparer(views, settings.verification)
