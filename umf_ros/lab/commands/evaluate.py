@@ -445,8 +445,7 @@ def sensors(
     from umf_ros.lab.commands import simulate
     from umf_ros.lab.evaluation.inspection import check_sensors
     from umf_ros.lab.evaluation.results import print_table
-    from umf_ros.lab.evaluation.sensors_run import replay_all, score, stretches_of, table_of
-    from umf_ros.runs.findings import about_sensors
+    from umf_ros.lab.evaluation.sensors_run import describe_sensors, replay_all, score, stretches_of, table_of
 
     console = Console()
     check_writable(out)
@@ -456,8 +455,7 @@ def sensors(
             simulate.write_drive(bag, console, "sensors", (seed, None))
     stretches = stretches_of(bag)
     recording = open_bag(bag)
-    told = [one.line for one in about_sensors(check_sensors(recording, settings_for(recording, config, "auto")))]
-    for line in told or ["nothing is wrong with light, clocks, mountings and baseline"]:
+    for line in describe_sensors(check_sensors(recording, settings_for(recording, config, "auto"))):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     folder = create_run_folder(out)
     with console.status("replaying") as status:
