@@ -7,6 +7,7 @@ import signal
 import sys
 from functools import cache
 from importlib import import_module
+from inspect import getdoc
 from typing import Annotated, NoReturn
 
 import typer
@@ -67,11 +68,20 @@ def umf() -> typer.Typer:
         module, _, member = place.partition(":")
         command = getattr(import_module(module), member or "command")
         if isinstance(command, typer.Typer):
+            _join_lines(command)
             app.add_typer(command, name=name)
         else:
             app.command(name)(command)
+    _join_lines(app)
     app.callback()(_options)
     return app
+
+
+def _join_lines(app: typer.Typer) -> None:
+    """Join the lines of each paragraph of the commands' help: typer keeps line ends, and wraps again at 80 columns."""
+    for command in app.registered_commands:
+        text = command.help or getdoc(command.callback) or ""
+        command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
 
 
 def _options(version: Version = False) -> None:

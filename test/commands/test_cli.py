@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,14 @@ def test_every_command_explains_itself_and_its_options(words: list[str]) -> None
     assert umf(*words, "-h").out == ended.out
 
 
+@pytest.mark.parametrize("words", [["replay"], ["evaluate"], ["map", "make"], ["pretrain", "image"]])
+def test_paragraphs_of_the_help_fill_their_lines(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    prose = umf(*words, "--help").out.partition("╭")[0].splitlines()
+    for line, after in pairwise(line.strip() for line in prose):
+        assert not line or not after or len(f"{line} {after.split()[0]}") > 78, line
+
+
 def test_without_a_command_the_help_is_shown() -> None:
     ended = umf()
     assert ended.status == 2 and "Usage: umf" in ended.text and "replay" in ended.text
@@ -126,6 +135,18 @@ NO_BAG = "there is no recording nowhere.mcap"
         (["evaluate", "nowhere.mcap"], NO_BAG),
         (["explain", "nowhere.mcap", "1", "0"], NO_BAG),
         (["simulate"], "say where to write: OUT.mcap, --shards DIR or --contact-sheet OUT.png"),
+        (["simulate", "a.mcap", "--scale", "0.1", "--ray", "local"], "a drive has no use for --ray, --scale"),
+        (["simulate", "s3li-twin", "--out", "a", "--family", "moon"], "a twin of S3LI has no use for --family"),
+        (["simulate", "--shards", "a", "--truth", "--seed", "3"], "a folder of worlds has no use for --seed, --truth"),
+        (["simulate", "--shards", "a", "--sequences", "etna", "--ray", "local"], "sequences has no use for --ray"),
+        (["simulate", "a.mcap", "--contact-sheet", "a.png"], "a contact sheet has no use for OUT.mcap"),
+        (["demo", "--bag", "nowhere.mcap", "--duration", "20"], "a recording has no use for --duration"),
+        (["sensors", "nowhere.mcap", "--seed", "2"], "a recording has no use for --seed"),
+        (["replay", "nowhere.mcap", "--mode", "mapping", "--map", "a"], "a mapping run has no use for --map"),
+        (["train", "--recipe", "umf_scene", "--steps", "3"], "a recipe has no use for --steps"),
+        (["train", "a", "--method", "dbow2", "--resume"], "a vocabulary has no use for --resume"),
+        (["export", "net.xml", "--calibration", "a"], "a model of float32 has no use for --calibration"),
+        (["map", "edit", "a", "--accept", "1", "2", "--reject", "1", "2"], "given for the same closure"),
         (["simulate", "drive.bag"], "cannot write drive.bag: the name must end in .mcap"),
         (["simulate", "drive.mcap", "--preset", "olympus"], "unknown preset 'olympus'"),
         (["sensors", "nowhere.mcap"], NO_BAG),

@@ -13,7 +13,7 @@ import pytest
 import rasterio
 import yaml
 from command_line import Ended, only_line, umf
-from recordings import part_of
+from recordings import part_of, traverse, write_mcap
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
@@ -88,6 +88,8 @@ def wrong_calls(tmp_path: Path) -> Iterator[tuple[list[Path], str]]:
     yield [tmp_path / "empty"], "holds no recording"
     (tmp_path / "notes.txt").write_text("these are notes\n")
     yield [tmp_path / "notes.txt"], "notes.txt is not a recording"
+    small = write_mcap(tmp_path / "small.mcap", traverse(0.3))
+    yield [small, tmp_path / "notes.txt"], "notes.txt is not a recording"
 
 
 def test_what_a_user_gets_wrong_is_one_line(tmp_path: Path) -> None:
@@ -116,6 +118,8 @@ def test_a_rover_finds_itself_in_the_map_which_stays_as_it_is(
     assert len(rows) == about["located"] and all(float(row["probability"]) > 0.99 for row in rows)
     assert all(0 < float(row["sigma_x_m"]) < 1 for row in rows)
     assert {path: path.read_bytes() for path in before} == before
+    told = only_line(umf("replay", again, "--map", out, "--out", tmp_path / "none", "--resume"))
+    assert told == "a localising run has no use for --resume" and not (tmp_path / "none").exists()
 
 
 def test_the_map_is_a_point_cloud_too(made: tuple[Path, Ended]) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from command_line import only_line
 from command_line import umf as umf_here
-from recordings import ODOMETRY, TRUTH, traverse, write_mcap
+from recordings import LEFT, ODOMETRY, RIGHT, TRUTH, traverse, write_mcap
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
@@ -169,7 +169,7 @@ def test_ctrl_c_keeps_the_results_so_far(mini_bag: Path, mini_config: Path, tmp_
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGINT)
     output, _ = process.communicate(timeout=120)
-    assert process.returncode == 0 and "Interrupted" in output and "Traceback" not in output
+    assert process.returncode == 130 and "Interrupted" in output and "Traceback" not in output
     assert [name for name in FILES if not (tmp_path / "latest" / name).is_file()] == []
     summary = json.loads((tmp_path / "latest" / "summary.json").read_text())
     assert summary["keyframes"] == len(keyframes.read_text().splitlines()) - 1
@@ -204,6 +204,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
             f"dataset: input should be {either(list(map(repr, dataset_names())))}",
         ),
         (["{bag}", "--embedder", "magic"], "magic"),
+        (["{blind}", "--embedder", "netvlad"], "netvlad reads images alone, and {blind} has none"),
         (["{bag}", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
         (["{bag}", "--weights", "{notes}"], "notes.txt"),
         (["{bag}", "--odometry", "{notes}"], "line 1: expected numbers"),
@@ -230,12 +231,15 @@ def test_what_a_user_can_get_wrong_is_one_clear_line_and_leaves_nothing(
         "mounted": "calibration: /nowhere.yaml\n",
     }
     names = {"bag": small} | {name: tmp_path / f"{name}.txt" for name in written}
-    names["odometry"] = tmp_path / "odometry.mcap"
+    names |= {name: tmp_path / f"{name}.mcap" for name in ("odometry", "blind")}
+    write_mcap(names["blind"], [entry for entry in traverse(0.3) if entry[0] not in (LEFT, RIGHT)])
     write_mcap(names["odometry"], [entry for entry in traverse(0.3) if entry[0] == ODOMETRY])
     for name, content in written.items():
         names[name].write_text(content)
     filled = [argument.format(**names) for argument in arguments]
-    assert message in only_line(umf_here("replay", *filled, "--out", tmp_path / "out"))
+    assert message.replace("{blind}", str(names["blind"])) in only_line(
+        umf_here("replay", *filled, "--out", tmp_path / "out")
+    )
     assert not (tmp_path / "out").exists()
 
 

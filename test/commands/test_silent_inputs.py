@@ -18,7 +18,8 @@ SAID = {
 @pytest.mark.parametrize("absent", [(LEFT, RIGHT), (CLOUD, ODOMETRY)], ids=str)
 def test_every_silent_input_is_one_line(absent: tuple[str, ...], tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "bag.mcap", [entry for entry in traverse(1.0) if entry[0] not in absent])
-    ended = umf("replay", bag, "--embedder", "scan_context", "--out", tmp_path / "out")
+    method = "scan_context" if LEFT in absent else "thumbnail"
+    ended = umf("replay", bag, "--embedder", method, "--out", tmp_path / "out")
     page = (tmp_path / "out" / "latest" / "report.html").read_text("utf-8")
     for topic, line in SAID.items():
         assert ended.text.count(line) == (1 if topic in absent else 0), ended.text

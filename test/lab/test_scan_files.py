@@ -38,6 +38,19 @@ def test_repetitions_are_unpacked(tmp_path: Path) -> None:
     assert len(found.points) == 3000 and np.all(found.points == [1.5, -2.0, 0.25]) and found.intensity is None
 
 
+@pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
+def test_a_scan_that_breaks_off_is_refused(tmp_path: Path, form: str) -> None:
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(POINTS))
+    path = tmp_path / "scan.pcd"
+    o3d.t.io.write_point_cloud(str(path), cloud, write_ascii=form == "ascii", compressed=form == "binary_compressed")
+    content = path.read_bytes()
+    assert f"DATA {form}".encode() in content
+    changes = {"binary_compressed": content.replace(b"POINTS 500", b"POINTS 501")}
+    path.write_bytes(changes.get(form, content[:-30]))
+    with pytest.raises(SensorFileError, match=r"break off after \d+ of 50\d points"):
+        read_scan(path)
+
+
 def test_odd_headers_are_understood(tmp_path: Path) -> None:
     """Padding, counts, other types and cases, a width of 0, Windows' line ends, and a file that breaks off."""
     record = np.dtype(
@@ -57,9 +70,9 @@ def test_odd_headers_are_understood(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.intensity, np.floor(INTENSITY[:-1]))
 
 
-def test_text_with_more_and_less_than_the_header_says(tmp_path: Path) -> None:
+def test_text_with_more_than_the_header_says(tmp_path: Path) -> None:
     path = tmp_path / "scan.pcd"
-    path.write_text("COLUMNS x y z\nPOINTS 9\nDATA ascii\n1 2 3\n\nnan nan nan\n0 0 0\n-nan 1 1\n4 5 6\n7 8\n")
+    path.write_text("COLUMNS x y z\nPOINTS 5\nDATA ascii\n1 2 3\n\nnan nan nan\n0 0 0\n-nan 1 1\n4 5 6\n7 8\n")
     np.testing.assert_array_equal(read_scan(path).points, [[1, 2, 3], [4, 5, 6]])
 
 
@@ -89,10 +102,13 @@ def test_arrays(tmp_path: Path, columns: int, dtype: type) -> None:
     assert (found.intensity is None) == (columns == 3)
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(COUNT, 4), (COUNT, 3), (COUNT - 1, 3), (COUNT - 2, 4)])
+SHAPES = [(COUNT, 4), (COUNT, 3), (COUNT - 1, 3), (COUNT - 2, 4), (COUNT, 5), (COUNT - 1, 5), (COUNT - 20, 5)]
+
+
+@pytest.mark.parametrize(("rows", "columns"), SHAPES)
 def test_the_columns_of_raw_numbers_are_found(tmp_path: Path, rows: int, columns: int) -> None:
-    """Also where either could be: 500 and 498 points of 3 and 4 numbers make a multiple of 12."""
-    ALL[:rows, :columns].tofile(tmp_path / "scan.bin")
+    """Also where others could be: 500 and 498 points of 3 and 4 numbers make a multiple of 12, 480 of 5 one of 60."""
+    np.column_stack([ALL, np.arange(COUNT) % 32])[:rows, :columns].astype(np.float32).tofile(tmp_path / "scan.bin")
     found = read_scan(tmp_path / "scan.bin")
     np.testing.assert_array_equal(found.points, POINTS[:rows])
     assert (found.intensity is None) == (columns == 3)

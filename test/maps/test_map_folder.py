@@ -4,7 +4,7 @@ import pytest
 from maps_made import MadeSession, made_map
 
 from umf_ros.core.config import Settings, load_settings
-from umf_ros.core.errors import UmfError
+from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.maps.map_folder import APART_NS, MapFolder
 
 DAY_NS = 86_400 * 10**9
@@ -35,9 +35,17 @@ def test_a_map_is_read_back_and_recognises_its_recordings(tmp_path: Path) -> Non
 
 
 def test_settings_of_the_first_recording_stay(tmp_path: Path) -> None:
-    MapFolder.open_or_create(tmp_path, load_settings(None, loop__top_k=7))
+    MapFolder.open_or_create(tmp_path, load_settings(None, loop__top_k=5))
+    made_map(tmp_path, [MadeSession("a", 0, 30)], load_settings(None, loop__top_k=7))  # the first call failed
     again = MapFolder.open_or_create(tmp_path, Settings())
     assert again.settings.loop.top_k == 7
+
+
+def test_a_folder_of_other_files_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("mine")
+    with pytest.raises(OutputError, match="holds other files and no map"):
+        MapFolder.open_or_create(tmp_path, Settings())
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
 def test_other_folders_are_refused_in_one_line(tmp_path: Path) -> None:

@@ -168,7 +168,13 @@ def test_causes_come_before_what_they_bring_about(tmp_path: Path) -> None:
         warnings=["min_intensity 15 is not applied"],
         interrupted=True,
     )
-    assert [finding.severity for finding in look_first(about)] == ["warning", "fault", "note"]
+    assert [finding.severity for finding in look_first(about)] == ["warning", "fault", "warning"]
+
+
+def test_a_run_that_did_not_end_is_not_reported_as_complete(tmp_path: Path) -> None:
+    about = examined(tmp_path, [closure(50, 10)], verdict=accepted(), truth=trajectory(), interrupted=True)
+    mark, _, sentence = verdict(about)
+    assert mark == "warn" and sentence.startswith("The run did not end: results cover the part before. 1 true")
 
 
 LIDAR = Disagreement(0.0, np.array([0.0, 9.0, 1.0]))

@@ -18,6 +18,7 @@ from umf_ros.core.config import Settings, Topics, topics_of
 from umf_ros.core.errors import BagError, MessageError, either
 from umf_ros.core.frames import Frame
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.embedding import check_inputs
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import TYPES, OdometrySample, stamp_ns
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
@@ -49,8 +50,10 @@ class FrameReader:
         Raises:
             BagError: there are neither images nor scans, they have other types, or the trajectory covers another time.
             CalibrationError: the calibration cannot be read.
+            ConfigError: the embedding method reads only images, or only scans, and there are none.
         """
         topics = _present(topics_of(settings), bag)
+        check_inputs(settings.embedding.method, bag.path, bool(topics.left_image), bool(topics.cloud))
         if odometry is not None:
             _check_overlap(odometry, bag)
             topics = topics.model_copy(update={"odometry": ""})

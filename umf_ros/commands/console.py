@@ -52,8 +52,11 @@ def _in_graph(counts: Mapping[str, int]) -> str:
 
 
 @contextmanager
-def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether Ctrl-C or SIGTERM came; a second one ends the process as usual."""
+def stop_on_interrupt() -> Iterator[Callable[[], int]]:
+    """Yield a function that returns the number of the signal, Ctrl-C or SIGTERM, that came; 0 where none did.
+
+    A second one ends the process as usual.
+    """
     signals: list[int] = []
 
     def remember(number: int, _: FrameType | None) -> None:
@@ -61,7 +64,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         _restore(before)
 
     with _handled_by(remember) as before:
-        yield lambda: bool(signals)
+        yield lambda: signals[0] if signals else 0
 
 
 def undisturbed() -> AbstractContextManager[object]:

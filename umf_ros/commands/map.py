@@ -16,6 +16,7 @@ from umf_ros.core.errors import ConfigError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from umf_ros.bags.reader import Bag
     from umf_ros.maps.map_folder import MapFolder
     from umf_ros.maps.mapping import Opening
 
@@ -94,8 +95,9 @@ def command(
     check_writable(out)
     opening = Opening(config, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
     found = find_recordings(recordings)
-    target = MapFolder.open_or_create(out, opening.settings(open_bag(found[0])))
-    new = _new_recordings(target, found, console)
+    bags = [open_bag(one) for one in found]  # before there is a folder
+    target = MapFolder.open_or_create(out, opening.settings(bags[0]))
+    new = _new_recordings(target, bags, console)
     if ray is None and workers == 1:
         for name, recording in new.items():
             _add(target, name, recording, opening, console)
@@ -129,6 +131,9 @@ def edit(
     from umf_ros.maps.map_folder import MapFolder
     from umf_ros.maps.outputs import write_results
 
+    decided = [pair for pair in (reject, accept, undo) if pair]
+    if len(set(decided)) < len(decided):
+        raise ConfigError("--reject, --accept and --undo are given for the same closure: leave one of them")
     target = MapFolder.open(map_folder)
     edits = target.edits()
     edits |= {pair: state for pair, state in ((reject, State.REJECTED), (accept, State.ACCEPTED)) if pair}
@@ -187,15 +192,14 @@ def export(
     typer.echo(f"{folder}: map.yaml, map.pgm" + (f"; {missing}" if missing else ", elevation.tif"))
 
 
-def _new_recordings(target: MapFolder, recordings: list[Path], console: Console) -> dict[str, Path]:
+def _new_recordings(target: MapFolder, bags: list[Bag], console: Console) -> dict[str, Path]:
     """The recordings that are not in the map yet, by the names of their sessions to be."""
-    from umf_ros.bags.reader import open_bag
     from umf_ros.runs.reader import describe_recording
 
     new: dict[str, Path] = {}
     described = []
-    for recording in recordings:
-        about = describe_recording(open_bag(recording)) | {"path": ""}
+    for bag in bags:
+        about, recording = describe_recording(bag) | {"path": ""}, bag.path
         known = target.find(about)
         if known is not None or about in described:
             as_name = f", as {known.name}" if known else ""

@@ -15,7 +15,7 @@ from umf_ros.core.resources import dataset_names
 from umf_ros.embedding import choices
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.reader import Bag
@@ -73,6 +73,13 @@ def open_recording(
     recording = open_bag(bag)
     overrides |= {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}
     return recording, settings_for(recording, config, dataset, **overrides)
+
+
+def refuse_unused(what: str, options: Mapping[str, object]) -> None:
+    """Raise a `ConfigError` if one of some options, by their names, is given that `what` would ignore."""
+    given = [name for name, value in options.items() if value]
+    if given:
+        raise ConfigError(f"{what} {'has' if what.startswith('a ') else 'have'} no use for {', '.join(given)}")
 
 
 def check_odometry_options(odometry: Path | None, odometry_frame: str) -> str:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from umf_ros.commands import recordings as options
-from umf_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -50,9 +49,10 @@ def command(
     """Find loop closures in a recording as fast as the machine goes.
 
     Needs no ROS. Writes closures, trajectories, the pose graph and a report to a new folder.
-    Ctrl-C ends the run early and keeps its results; --resume continues it, also after a crash. Exit status 3: the
-    inputs could not give any result.
+    Ctrl-C ends the run early and keeps its results, with exit status 130; --resume continues it, also after a crash.
+    Exit status 3: the inputs could not give any result.
     """
+    options.refuse_unused("a mapping run", {"--map": mode == "mapping" and map_folder})
     options.check_files(bag, config, odometry, ground_truth)
     options.check_map(map_folder)
     odometry_frame = options.check_odometry_options(odometry, odometry_frame)
@@ -88,14 +88,14 @@ def command(
     warnings: list[str] = []
     reader = options.open_frames(recording, settings, partial(_warn, console, warnings), odometry, odometry_frame)
     truth = read_ground_truth(None, ground_truth)
-    if settings.localizing and rerun:
-        raise ConfigError("--rerun is for mapping runs: leave it out with --map")
+    if settings.localizing:
+        options.refuse_unused("a localising run", {"--rerun": rerun, "--resume": resume})
     network = starting.result()
     viewer = RerunLog(rerun, settings.terrain) if rerun else None
     # a store or a map that cannot be used is reported before there is a folder
     known = settings.database.path or (settings.localizing and not settings.grows_map)
     detector = LoopDetector(settings, network) if known else None
-    unfinished = unfinished_folder(out, bag, settings) if resume and not settings.localizing else None
+    unfinished = unfinished_folder(out, bag, settings) if resume else None
     folder = unfinished or create_folder(out, bag)
     detector = detector or LoopDetector(with_places(settings, folder), network)
     del network, starting  # only the detector keeps the network, until it is closed: the report needs the memory
@@ -126,7 +126,7 @@ def command(
             recording,
             inputs=input_counts(reader.counters),
             warnings=warnings,
-            interrupted=interrupted(),
+            interrupted=bool(interrupted()),
             odometry_file={"path": str(odometry.resolve()), "frame": odometry_frame} if odometry else None,
         )
         if settings.localizing:
@@ -139,7 +139,7 @@ def command(
             run = read_run(folder, recording, truth)
             status = finish_run(run, recording, console, sensors, frozenset(warnings + absent)).exit_code
     replay.raise_if_frames_failed()
-    raise typer.Exit(status)
+    raise typer.Exit(128 + interrupted() if interrupted() else status)
 
 
 def _tell_inputs(console: Console, settings: Settings) -> None:

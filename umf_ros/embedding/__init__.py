@@ -29,6 +29,12 @@ _MODULES = {
     **dict.fromkeys(("minkloc_visual", "minkloc_lidar", "minkloc_fusion"), "umf_ros.baselines.place_networks"),
 }
 """Modules of the methods that come with the package, each with a function `make`."""
+_READS = {
+    **dict.fromkeys(("thumbnail", "gradients", "dbow2", "lite0", "lite0_mean", "lite0_gem"), "images"),
+    **dict.fromkeys(("netvlad", "minkloc_visual"), "images"),
+    **dict.fromkeys(("solid", "scan_context", "pointnet2", "minkloc_lidar"), "scans"),
+}
+"""Input of the methods that read one alone; without it all frames have one descriptor."""
 
 
 class FeatureRequest(NamedTuple):
@@ -64,6 +70,13 @@ def find_methods() -> tuple[str, ...]:
 def choices() -> str:
     """Return the names of all methods as a choice, for help texts."""
     return either(find_methods())
+
+
+def check_inputs(method: str, source: object, images: bool, scans: bool) -> None:
+    """Raise a `ConfigError` if a source has no input that a method reads."""
+    reads = _READS.get(method)
+    if (reads == "images" and not images) or (reads == "scans" and not scans):
+        raise ConfigError(f"the embedding method {method} reads {reads} alone, and {source} has none")
 
 
 def make_embedder(settings: EmbeddingSettings, super_features: bool = False, features: str = OWN_FEATURES) -> Embedder:

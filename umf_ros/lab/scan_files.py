@@ -48,6 +48,8 @@ _PLY_KINDS = {
     **{"float": "f4", "double": "f8", "list": "list"},
 }
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
+BIN_COLUMNS = (4, 5, 3)
+"""Numbers per point of a .bin, in the order in which they are tried."""
 _MOST_NEGATIVE = 0.01
 """Share of negative numbers that no column of intensities has: every other coordinate is negative."""
 
@@ -57,7 +59,7 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
 
     Files are .pcd (ascii, binary, binary_compressed), .ply (ascii, binary), or .npy and .bin of (N, 3) or (N, 4)
     numbers, x y z in metres and intensity; further columns are ignored. A .bin holds float32 with `bin_columns` numbers
-    per point; 0: 4 as in KITTI, 3 where only that can be.
+    per point; 0: 4 as in KITTI, 5 as in nuScenes or 3, the first that fits the size and has no negative intensities.
 
     Raises:
         SensorFileError: the file cannot be read, is none of these, or holds no return; names it.
@@ -87,7 +89,7 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
 def parse_pcd(content: bytes) -> Columns:
     """Return the fields of the points, (N,) each or (N, count), by name in lower case.
 
-    The data decide how many there are where the header says otherwise (WIDTH 0, a file that breaks off).
+    The data decide how many there are where the header does not say (POINTS 0).
 
     Raises:
         SensorFileError: it is no such file, or the data are not what the header says.
@@ -110,10 +112,18 @@ def parse_pcd(content: bytes) -> Columns:
         return _parse_text(body, record, points)
     if kind == "binary":
         stored = len(body) // record.itemsize
-        return _unpack(body, record, min(points or stored, stored))
+        _check_whole(stored, points)
+        return _unpack(body, record, points or stored)
     if kind == "binary_compressed":
-        return _unpack_by_field(_decompress(body), record)
+        body = _decompress(body)
+        _check_whole(len(body) // record.itemsize, points)
+        return _unpack_by_field(body, record)
     raise SensorFileError(f"PCD data of kind {kind!r}")
+
+
+def _check_whole(stored: int, points: int) -> None:
+    if stored < points:
+        raise SensorFileError(f"data that break off after {stored} of {points} points")
 
 
 def _pcd_record(entries: dict[str, list[str]]) -> Record:
@@ -161,6 +171,7 @@ def _parse_text(body: bytes, record: Record, points: int) -> Columns:
         numbers = np.array(body.decode("ascii").split(), dtype=np.float64)
         whole = len(numbers) // sum(widths)
         rows = numbers[: whole * sum(widths)].reshape(-1, sum(widths))[: points or whole]
+        _check_whole(whole, points)
     except ValueError:
         last = max((names.index(name) for name in "xyz" if name in names), default=-1) + 1
         widths = widths[:last]
@@ -291,13 +302,13 @@ def _parse_bin(content: bytes, columns: int) -> Columns:
     if len(content) % 4:
         raise SensorFileError(f"{len(content)} bytes are no float32 numbers")
     numbers = np.frombuffer(content, "<f4")
-    fitting = [count for count in ((columns,) if columns else (4, 3)) if len(numbers) % count == 0]
-    if not fitting:
-        shapes = f"(N, {columns})" if columns else "(N, 3) or (N, 4)"
-        raise SensorFileError(f"{len(numbers)} numbers are no {shapes}; --bin-columns says how many a point has")
-    if fitting == [4, 3] and len(numbers) and np.mean(numbers[3::4] < 0) > _MOST_NEGATIVE:
-        fitting = [3]
-    return _by_name(numbers.reshape(-1, fitting[0]))
+    for count in (columns,) if columns else BIN_COLUMNS:
+        # coordinates among the intensities: the points are longer or shorter
+        negative = 0 if columns or count == 3 else np.count_nonzero(numbers[3::count] < 0)
+        if len(numbers) % count == 0 and negative <= _MOST_NEGATIVE * (len(numbers) // count):
+            return _by_name(numbers.reshape(-1, count))
+    shapes = either([f"(N, {count})" for count in ((columns,) if columns else BIN_COLUMNS)])
+    raise SensorFileError(f"{len(numbers)} numbers are no {shapes}; --bin-columns says how many a point has")
 
 
 def _by_name(array: NDArray) -> Columns:

@@ -14,7 +14,7 @@ from typing import Any
 
 from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import Settings, dump_settings, load_settings
-from umf_ros.core.errors import UmfError, reading, writing
+from umf_ros.core.errors import OutputError, UmfError, reading, writing
 from umf_ros.core.frames import State
 from umf_ros.core.io import write_atomically
 from umf_ros.places.database import PLACES_OF_MAP
@@ -85,14 +85,18 @@ class MapFolder:
 
     @classmethod
     def open_or_create(cls, path: Path, settings: Settings) -> MapFolder:
-        """Open an existing map, or create one with these settings."""
+        """Open an existing map, or create one with these settings; so is one without sessions, left by a failure."""
         if (path / "map.json").is_file():
-            return cls.open(path)
+            folder = cls.open(path)
+            if folder.sessions:
+                return folder
+        elif path.is_dir() and any(path.iterdir()):
+            raise OutputError(f"{path} holds other files and no map: name another folder; nothing was written")
         folder = cls(path)
         with writing(f"to {path}"):
             path.mkdir(parents=True, exist_ok=True)
-        write_atomically(path / "config.yaml", dump_settings(settings))
         folder._write()
+        write_atomically(path / "config.yaml", dump_settings(settings))
         return folder
 
     @property

@@ -229,7 +229,8 @@ def _speed(about: JudgedRun) -> Iterator[Advice]:
 
 def _end(about: JudgedRun) -> Iterator[Advice]:
     if about.run.summary.get("interrupted"):
-        yield Advice("note", "the run was interrupted: results cover the part before")
+        what = "the run did not end: results cover the part before"
+        yield Advice("warning", what, "umf replay --resume continues a replay")
 
 
 BLANK, DIM = 3.0, 8.0

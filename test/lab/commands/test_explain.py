@@ -88,6 +88,15 @@ def test_a_picture_that_cannot_be_written_is_one_line(small: tuple[Path, list[st
     assert f"cannot write {target}" in only_line(umf("explain", bag, "3", "1", *options[:-1], target))
 
 
+def test_a_picture_has_the_name_that_was_given(small: tuple[Path, list[str | Path]], tmp_path: Path) -> None:
+    bag, options = small
+    assert umf("explain", bag, "3", "1", *options[:-1], tmp_path / "picture").status == 0
+    assert (tmp_path / "picture").read_bytes().startswith(b"\x89PNG")
+    assert "picture.odd: Format 'odd'" in only_line(
+        umf("explain", bag, "3", "1", *options[:-1], tmp_path / "picture.odd")
+    )
+
+
 def test_a_recording_whose_images_are_all_refused_is_one_line(tmp_path: Path) -> None:
     config = tmp_path / "config.yaml"
     config.write_text(dump_settings(small_settings(tmp_path)))

@@ -146,4 +146,5 @@ def test_the_picture_goes_where_it_should(tmp_path: Path) -> None:
     result = run("plot", write_world(tmp_path / "a.g2o", RIGHT), "-o", tmp_path / "b.png")
     assert result.exit_code == 0 and "b.png" in result.output
     assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
+    assert run("plot", tmp_path / "a.g2o", "-o", tmp_path / "c").exit_code == 0 and (tmp_path / "c").is_file()
     assert isinstance(run("plot", tmp_path / "a.g2o", "-o", tmp_path / "no" / "b.png").exception, OutputError)

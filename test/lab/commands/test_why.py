@@ -44,5 +44,10 @@ def test_a_moment_is_a_stamp_or_seconds(run: Path) -> None:
 
 def test_what_is_wrong_is_one_line(run: Path, tmp_path: Path) -> None:
     assert only_line(umf("why", tmp_path, "3")) == f"{tmp_path} holds no finished run: summary.json is missing"
+    for moment in ("500", str(START_NS - 2 * 10**9)):
+        line = only_line(umf("why", run, moment))
+        assert line.startswith(
+            f"{moment} is outside of {run}: its keyframes are at 0 to 3.4 s, {START_NS + 100_000_000} "
+        )
     ended = umf("why", run, "soon")
     assert ended.status == 2 and "'soon' is neither a stamp in ns nor seconds from the start" in ended.text

@@ -10,8 +10,9 @@ import pytest
 from command_line import only_line, umf
 from finished_runs import closure, examined, stamp, trajectory
 
+from umf_ros.bags.sensor_check import Disagreement, SensorReport
 from umf_ros.core.errors import UmfError
-from umf_ros.lab.evaluation.sensors_run import Stretch, score, stretches_of, table_of
+from umf_ros.lab.evaluation.sensors_run import Stretch, describe_sensors, score, stretches_of, table_of
 
 EARLY, LATE = Stretch("early", stamp(40), stamp(59.5)), Stretch("late", stamp(59.6), stamp(80))
 
@@ -32,6 +33,16 @@ def test_without_a_truth_nothing_is_judged(tmp_path: Path) -> None:
     about = examined(tmp_path, closures=[closure(50, 10)])
     with pytest.raises(UmfError, match="no ground truth"):
         score(replace(about, run=replace(about.run, truth=None)), [EARLY])
+
+
+def test_what_was_not_measured_is_not_called_right() -> None:
+    assert describe_sensors(SensorReport()) == ["could not be measured: light, clocks, mountings, baseline"]
+    seen = SensorReport(left_contrast=40.0, lidar=Disagreement(0.0, None))
+    unknown = "could not be measured: mountings, baseline"
+    assert describe_sensors(seen) == ["nothing is wrong with light, clocks", unknown]
+    late = replace(seen, lidar=Disagreement(0.5, None))
+    told, *rest = describe_sensors(late)
+    assert "the LiDAR's clock" in told and rest == [unknown]
 
 
 def test_one_recording_is_replayed_with_both_sensors_and_with_each(

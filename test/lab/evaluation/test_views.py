@@ -13,7 +13,7 @@ from submaps_drives import Drive, drive, rough_ground
 
 from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.core.config import Verification
-from umf_ros.core.errors import CalibrationError, UmfError
+from umf_ros.core.errors import CalibrationError, ConfigError, UmfError
 from umf_ros.core.frames import Embedding, Frame
 from umf_ros.core.geometry import invert, make_pose, relative, transform
 from umf_ros.lab.evaluation import place_views
@@ -61,6 +61,13 @@ def test_with_a_calibration_images_belong_to_it(here: Path) -> None:
     (frame,) = embedder.frames
     assert frame.left is not None and frame.right is not None and frame.points is not None
     assert frame.camera.fx == 60
+
+
+def test_a_view_without_what_the_method_reads_is_refused(here: Path) -> None:
+    source = ViewReader(CountingEmbedder(), method="netvlad")
+    with pytest.raises(ConfigError, match=r"netvlad reads images alone, and .*scan\.npy has none"):
+        source.keyframe(PlaceView(str(here / "scan.npy")))
+    source.keyframe(PlaceView("", str(here / "left.png")))
 
 
 def test_without_one_they_are_left_aside_and_it_says_so_once(here: Path) -> None:

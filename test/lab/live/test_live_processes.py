@@ -117,6 +117,12 @@ def test_when_one_node_dies_the_others_finish_and_it_is_told(bag: Path, tmp_path
     assert json.loads((tmp_path / "summary.json").read_text())["drops"]["worker"] == 0
 
 
+def test_a_demo_that_can_find_nothing_has_the_status_of_such_a_replay(bag: Path, tmp_path: Path) -> None:
+    ended = umf("demo", "--bag", bag, "--rate", "2", "--out", tmp_path)
+    assert ended.status == 3, ended.text
+    assert "the gap rules exclude every pair" in ended.text
+
+
 def test_ctrl_c_ends_the_demo_with_a_complete_report(bag: Path, tmp_path: Path) -> None:
     latest = tmp_path / "latest"
 
@@ -126,7 +132,7 @@ def test_ctrl_c_ends_the_demo_with_a_complete_report(bag: Path, tmp_path: Path) 
 
     once(lambda: frames_done() > 0, lambda: os.kill(os.getpid(), signal.SIGINT))
     ended = umf("demo", "--bag", bag, "--rate", "0.1", "--out", tmp_path)
-    assert ended.status == 0, ended.text
+    assert ended.status == 130, ended.text
     assert "Interrupted: the report covers what was done so far." in ended.text
     # what the nodes say is shown as it comes, and kept
     told = "image of 64 x 48 pixels, the calibration is for 688 x 512"

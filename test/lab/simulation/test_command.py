@@ -11,7 +11,7 @@ from typing import get_type_hints
 import pytest
 from processes import wait_until
 
-from umf_ros.core.errors import UmfError
+from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.lab.commands.simulate import command
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.presets import PRESETS
@@ -48,6 +48,14 @@ def test_places_that_cannot_be_written(tmp_path):
     for out in (tmp_path / "file" / "drive.mcap", tmp_path / "drive.bag"):
         with pytest.raises(UmfError, match="cannot write"):
             command(out)
+
+
+@pytest.mark.parametrize("name", ["drive.mcap", "drive.pos"])
+def test_nothing_is_overwritten(tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(OutputError, match=f"{name} is there already"):
+        command(tmp_path / "drive.mcap", duration=2.0)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
 def test_without_a_place_to_write_it_says_what_is_missing():

@@ -35,7 +35,7 @@ def command(
     out: Annotated[Path | None, typer.Option(help="CSV file for the verdicts on the list.")] = None,
     calibration: Annotated[Path | None, typer.Option(help="Calibration file, or name of a data set.")] = None,
     bin_columns: Annotated[
-        int, typer.Option(min=0, max=64, help="Numbers per point of a .bin file; 0: 4, else 3.")
+        int, typer.Option(min=0, max=64, help="Numbers per point of a .bin file; 0: 4, 5 or 3, by its data.")
     ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
     config: ConfigPath = None,
@@ -79,6 +79,7 @@ def command(
         config,
         dataset,
         warn=lambda text: errors.print(text, **WARNING),
+        method=settings.embedding.method,
     )
     views.expect(view for pair in asked for view in pair)
     comparer = Comparer(views, settings.verification)

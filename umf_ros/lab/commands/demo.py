@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from umf_ros.commands.recordings import BagPath, check_files
+from umf_ros.commands.recordings import BagPath, check_files, refuse_unused
 from umf_ros.core.errors import UmfError
 
 
@@ -22,8 +23,12 @@ def command(
 ) -> None:
     """Simulate a short traverse, play it to the live nodes over DDS, and write a report.
 
-    Bag player, loop_closure_node and pose_graph_node run as separate processes, as next to a rover.
+    Bag player, loop_closure_node and pose_graph_node run as separate processes, as next to a rover. Ctrl-C ends them
+    early and keeps the results, with exit status 130. Exit status 3: the inputs could not give any result.
     """
+    if bag is not None:
+        refuse_unused("a recording", {"--seed": seed != 1, "--duration": duration is not None})
+
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
@@ -38,14 +43,15 @@ def command(
     check_writable(out)
     if bag is None:
         bag = Path("data") / f"demo_seed{seed}.mcap"
-        simulate.command(bag, preset="demo", seed=seed, duration=duration)
+        simulate.write_drive(bag, console, "demo", (seed, None), duration)
     recording = open_bag(bag)
     folder = create_run_folder(out)
     with LiveGraph(folder, console) as graph:
         graph.play(bag, recording.duration_s, rate)
     with undisturbed():
-        remember_recording(folder, recording)
-        report_run(folder, recording, console)
+        remember_recording(folder, recording, interrupted=graph.interrupted)
+        status = report_run(folder, recording, console).exit_code
+    raise typer.Exit(128 + signal.SIGINT if graph.interrupted else status)
 
 
 def play(

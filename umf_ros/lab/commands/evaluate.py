@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,6 +21,7 @@ from umf_ros.commands.recordings import (
     check_odometry_options,
     open_frames,
     open_recording,
+    refuse_unused,
 )
 from umf_ros.core.errors import ConfigError
 from umf_ros.embedding import choices
@@ -273,19 +274,19 @@ def command(
     of_recordings |= {"--odometry": odometry, "--ground-truth": ground_truth}
     every = EveryMethod(weights, trained, quick, out) if methods == "all" else None
     if data is None:
-        _refuse("simulated worlds", of_lists | of_recordings)
+        refuse_unused("simulated worlds", of_lists | of_recordings)
         chosen = str(worlds), seed, count
         figures = every.worlds(*chosen) if every else _on_worlds(*chosen, quick, weights, out)
     elif listed and lists_place_sets(data):
         allowed = () if every else ("--embedder", "--config")
         others = {name: value for name, value in of_recordings.items() if name not in allowed}
-        _refuse("a list of place sets", of_worlds | of_lists | others)
+        refuse_unused("a list of place sets", of_worlds | of_lists | others)
         figures = every.places(data) if every else _on_places(data, config, embedder, weights, out)
     elif listed:
-        _refuse("a list of sequences", of_worlds | of_recordings)
+        refuse_unused("a list of sequences", of_worlds | of_recordings)
         figures = every.sequences(data, rule) if every else _on_sequences(data, rule, weights, out)
     else:
-        _refuse("a recording", of_worlds | of_lists | ({"--embedder": embedder} if every else {}))
+        refuse_unused("a recording", of_worlds | of_lists | ({"--embedder": embedder} if every else {}))
         opened = RecordingOptions(data, config, dataset, embedder, odometry, odometry_frame, ground_truth)
         figures = every.recording(opened) if every else _on_recording(opened, weights, out)
     if json_file is not None:
@@ -304,13 +305,6 @@ def _check(data: Path | None, worlds: str | None, methods: str, trained: Path | 
         raise ConfigError(f"--methods: expected umf or all, not {methods!r}")
     if trained is not None and methods == "umf":
         raise ConfigError("--trained names weights of other methods, and without --methods all there are none")
-
-
-def _refuse(data: str, options: Mapping[str, object]) -> None:
-    """Refuse options that would be ignored."""
-    given = [name for name, value in options.items() if value]
-    if given:
-        raise ConfigError(f"{data} {'has' if data.startswith('a ') else 'have'} no use for {', '.join(given)}")
 
 
 def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Path | None, out: Path) -> Figures:
@@ -437,6 +431,7 @@ def sensors(
     images are black. Takes some minutes.
     """
     if bag is not None:
+        refuse_unused("a recording", {"--seed": seed != 1})
         check_files(bag, config)
 
     import json
@@ -450,19 +445,17 @@ def sensors(
     from umf_ros.lab.commands import simulate
     from umf_ros.lab.evaluation.inspection import check_sensors
     from umf_ros.lab.evaluation.results import print_table
-    from umf_ros.lab.evaluation.sensors_run import replay_all, score, stretches_of, table_of
-    from umf_ros.runs.findings import about_sensors
+    from umf_ros.lab.evaluation.sensors_run import describe_sensors, replay_all, score, stretches_of, table_of
 
     console = Console()
     check_writable(out)
     if bag is None:
         bag = Path("data") / f"sensors_seed{seed}.mcap"
         if not bag.exists():
-            simulate.command(bag, preset="sensors", seed=seed)
+            simulate.write_drive(bag, console, "sensors", (seed, None))
     stretches = stretches_of(bag)
     recording = open_bag(bag)
-    told = [one.line for one in about_sensors(check_sensors(recording, settings_for(recording, config, "auto")))]
-    for line in told or ["nothing is wrong with light, clocks, mountings and baseline"]:
+    for line in describe_sensors(check_sensors(recording, settings_for(recording, config, "auto"))):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     folder = create_run_folder(out)
     with console.status("replaying") as status:

@@ -15,10 +15,13 @@ if TYPE_CHECKING:
 
     from umf_ros.bags.reader import Bag
     from umf_ros.runs.diagnosis import ClosureDiagnosis
+    from umf_ros.runs.findings import RunVerdict
     from umf_ros.runs.truth import JudgedRun
 
 SHOWN = 8
 """Candidates and criteria in the terminal."""
+NEAR_NS = 10**9
+"""A moment so much before the first or after the last keyframe is theirs."""
 
 
 def command(
@@ -43,8 +46,10 @@ def command(
     report_run(folder, open_bag(bag), Console(), ground_truth)
 
 
-def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | None = None) -> None:
-    """Evaluate a run and write its report; read the recording again for the ground truth and the sensor check.
+def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | None = None) -> RunVerdict:
+    """Evaluate a run, write its report and return the verdict.
+
+    The recording is read again for the ground truth and the sensor check.
 
     Raises:
         UmfError: the run was made on another recording; nothing is written.
@@ -60,7 +65,7 @@ def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | No
         odometry = read_odometry(named["path"], named["frame"], run.settings)
     with console.status("Checking the sensors"):
         sensors = check_sensors(bag, run.settings, odometry, run.odometry)
-    finish_run(run, bag, console, sensors)
+    return finish_run(run, bag, console, sensors)
 
 
 def why(
@@ -92,7 +97,13 @@ def why(
     about = judge(read_run(folder, recording, truth), recording, keep=False)
     if not len(about.run.keyframes):
         raise UmfError(f"{folder} holds no keyframe")
-    asked_ns = _stamp(moment, int(about.run.stamps[0]))
+    first_ns, last_ns = int(about.run.stamps[0]), int(about.run.stamps[-1])
+    asked_ns = _stamp(moment, first_ns)
+    if not first_ns - NEAR_NS <= asked_ns <= last_ns + NEAR_NS:
+        seconds = (last_ns - first_ns) * 1e-9
+        raise UmfError(
+            f"{moment} is outside of {folder}: its keyframes are at 0 to {seconds:.1f} s, {first_ns} to {last_ns} ns"
+        )
     row = min(range(len(about.run.stamps)), key=lambda row: abs(int(about.run.stamps[row]) - asked_ns))
     _tell(Console(), about, row, explain(about, row))
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from umf_ros.commands.recordings import refuse_unused
 from umf_ros.core.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
@@ -16,6 +17,14 @@ if TYPE_CHECKING:
     from umf_ros.lab.simulation.survey import Survey
 
 TWIN = "s3li-twin"
+USED = {
+    "a drive": "OUT.mcap --preset --seed --world --duration --family --aliasing --image-rate --truth",
+    "a twin of S3LI": "OUT.mcap --out --seed --scale --sequences --fine",
+    "a contact sheet": "--contact-sheet --seed --family",
+    "a folder of sequences": "--shards --sequences --seed",
+    "a folder of worlds": "--shards --worlds --every --ray",
+}
+"""Options of what is written; all but a contact sheet use --workers."""
 
 
 def command(
@@ -67,10 +76,29 @@ def command(
 ) -> None:
     """Simulate a rover with S3LI's sensors: stereo, LiDAR, IMU, odometry, GNSS and ground truth.
 
-    Also writes OUT.odometry.tum and OUT.pos, like those of S3LI. The same seed gives the same bytes.
+    Also writes OUT.odometry.tum and OUT.pos, like those of S3LI; existing files are refused. The same seed gives the
+    same bytes.
     `umf simulate s3li-twin --out DIR` writes all fourteen sequences of S3LI as published files.
     """
+    if out is None and shards is None and contact_sheet is None:
+        raise ConfigError("say where to write: OUT.mcap, --shards DIR or --contact-sheet OUT.png")
+    given: dict[str, object] = {"OUT.mcap": out, "--preset": preset != "demo", "--seed": seed != 1}
+    given |= {"--world": world is not None, "--duration": duration is not None, "--family": family, "--truth": truth}
+    given |= {"--aliasing": aliasing is not None, "--image-rate": image_rate is not None, "--shards": shards}
+    given |= {"--worlds": worlds != "0:8", "--every": every != 1, "--sequences": sequences, "--ray": ray}
+    given |= {"--out": folder, "--scale": scale != 1, "--fine": fine, "--contact-sheet": contact_sheet}
+    what = "a drive"
+    if str(out) == TWIN:
+        what = "a twin of S3LI"
+    elif contact_sheet is not None:
+        what = "a contact sheet"
+    elif shards is not None:
+        what = "a folder of sequences" if sequences else "a folder of worlds"
+    refuse_unused(what, {name: value for name, value in given.items() if name not in USED[what].split()})
+
     from rich.console import Console
+
+    from umf_ros.core.io import check_absent
 
     console = Console()
     if str(out) == TWIN:
@@ -81,11 +109,10 @@ def command(
         if ray is None:
             _write_shards(shards, worlds, every, sequences, seed, workers, console)
         else:
-            _spread_shards(shards, worlds, every, sequences, workers, ray, console)
+            _spread_shards(shards, worlds, every, workers, ray, console)
     elif out is not None:
-        _write_bag(out, preset, (seed, world), duration, family, aliasing, image_rate, truth, workers, console)
-    else:
-        raise ConfigError("say where to write: OUT.mcap, --shards DIR or --contact-sheet OUT.png")
+        check_absent(out, out.with_suffix(".odometry.tum"), out.with_suffix(".pos"))
+        write_drive(out, console, preset, (seed, world), duration, family, aliasing, image_rate, truth, workers)
 
 
 def _write_twin(
@@ -117,18 +144,19 @@ def _write_twin(
     console.print(told, markup=False, highlight=False, soft_wrap=True)
 
 
-def _write_bag(
+def write_drive(
     out: Path,
+    console: Console,
     preset: str,
     seeds: tuple[int, int | None],
-    duration: float | None,
-    family: str | None,
-    aliasing: float | None,
-    image_rate: float | None,
-    truth: bool,
-    workers: int,
-    console: Console,
+    duration: float | None = None,
+    family: str | None = None,
+    aliasing: float | None = None,
+    image_rate: float | None = None,
+    truth: bool = False,
+    workers: int = 2,
 ) -> None:
+    """Write a drive and its side files, which replace earlier ones; `seeds` are those of the drive and of the world."""
     from umf_ros.lab.simulation.bag_writer import BagWriter
     from umf_ros.lab.simulation.presets import find_preset
     from umf_ros.lab.simulation.simulator import Simulator, record, write_side_files
@@ -167,14 +195,10 @@ def _write_shards(
             _write_shard(path, survey_world(world, family, setting, every=every), setting, workers, progress)
 
 
-def _spread_shards(
-    folder: Path, worlds: str, every: int, sequences: str, workers: int, ray: str, console: Console
-) -> None:
+def _spread_shards(folder: Path, worlds: str, every: int, workers: int, ray: str, console: Console) -> None:
     from umf_ros.core.tasks import spread
     from umf_ros.lab.simulation.survey import missing_worlds, seed_range, write_world
 
-    if sequences:
-        raise ConfigError("--ray spreads --worlds, not --sequences")
     missing = missing_worlds(folder, seed_range(worlds), every)
     with _progress(console) as progress:
         task = progress.add_task("worlds", total=len(missing))

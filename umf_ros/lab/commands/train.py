@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from umf_ros.commands.recordings import refuse_unused
 from umf_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -47,11 +48,16 @@ def command(
     """Train a network; under torchrun, on several processes or GPUs."""
     if (train is None) == (recipe is None):
         raise ConfigError("name the training data, or a --recipe")
+    unused: dict[str, object] = {"--validation": validation, "--preset": preset, "--steps": steps, "--loss": loss}
+    unused |= {"--start": start, "--resume": resume}
     if recipe is not None:
+        refuse_unused("a recipe", unused | {"--method": method, "--config": config})
         _follow(recipe, out, workers, seed=seed, threads=threads, workers=workers, device=device)
         return
     assert train is not None
     if method == "dbow2":
+        machine: dict[str, object] = {"--threads": threads, "--workers": workers, "--device": device}
+        refuse_unused("a vocabulary", unused | machine)
         _grow_vocabulary(config, train, seed, out)
         return
     from umf_ros.lab.training.trainer import load_run
@@ -116,6 +122,7 @@ def train_with_bar(settings: RunSettings, out: Path, resume: bool) -> None:
     typer.echo(f"weights: {weights}")
 
 
+CALIBRATION = Path("runs/calibration")
 app = typer.Typer(help="Pretrain an encoder without labels by masked reconstruction.", no_args_is_help=True)
 METHODS = {"image": "masked_images", "lidar": "masked_scans"}
 _AFTERWARDS = "\n\n`umf train --start` begins with the weights that result."
@@ -183,7 +190,7 @@ def export(
     ] = "float32",
     calibration: Annotated[
         Path, typer.Option(help="For int8: folder of rendered training worlds; missing ones are rendered.")
-    ] = Path("runs/calibration"),
+    ] = CALIBRATION,
 ) -> None:
     """Export a network to OpenVINO.
 
@@ -197,6 +204,8 @@ def export(
     from umf_ros.embedding.runtimes import MODEL_SUFFIX, outputs_of
     from umf_ros.networks.config import locate_weights
 
+    if precision != "int8":
+        refuse_unused("a model of float32", {"--calibration": calibration != CALIBRATION})
     if out.suffix not in (".xml", MODEL_SUFFIX):
         raise ConfigError(f"{out}: OpenVINO's files end in .xml, those of the embedder in {MODEL_SUFFIX}")
     check_writable(out.parent)

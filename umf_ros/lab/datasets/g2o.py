@@ -292,7 +292,7 @@ def _advance(graph: PoseGraph, recording: GraphRecording, start: int, end: int) 
     return max(start, end)
 
 
-def plot_graph(recording: GraphRecording, given: Mapping[int, Array], path: str | Path) -> None:
+def plot_graph(recording: GraphRecording, given: Mapping[int, Array], path: Path) -> None:
     """Draw odometry (dark) and closures (green) from above, and from the side where height varies.
 
     Args:
@@ -317,7 +317,7 @@ def plot_graph(recording: GraphRecording, given: Mapping[int, Array], path: str 
         _draw_graph(axes, points, recording.chains, closures)
     figure.suptitle(f"{len(at)} poses, {len(closures)} closures")
     with writing(path, ValueError):
-        figure.savefig(path, dpi=120)
+        figure.savefig(path, dpi=120, format=path.suffix[1:] or "png")  # the name as it is
 
 
 def _draw_graph(axes: Axes, points: Array, chains: list[int], closures: Array) -> None:

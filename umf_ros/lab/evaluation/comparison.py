@@ -232,7 +232,7 @@ def draw(explanation: Explanation, query_image: Image | None, match_image: Image
     stamps = f"query {explanation.query.stamp_ns}   match {explanation.match.stamp_ns}"
     figure.suptitle(f"{explanation.verdict}\n{stamps}", fontsize=14)
     with writing(path, ValueError):
-        figure.savefig(path, dpi=100)
+        figure.savefig(path, dpi=100, format=path.suffix[1:] or "png")  # the name as it is
 
 
 def _draw_images(axes: Any, explanation: Explanation, query: Image | None, match: Image | None) -> None:

@@ -16,7 +16,7 @@ from umf_ros.core.config import KeyframePolicy
 from umf_ros.core.errors import BagError, UmfError
 from umf_ros.core.frames import Frame, Keyframe
 from umf_ros.detector import NOT_EMBEDDED, KeyframeSelector, assemble, make_keyframe
-from umf_ros.embedding import Embedder
+from umf_ros.embedding import Embedder, check_inputs
 from umf_ros.embedding.depth import lift
 from umf_ros.lab.scan_files import (
     OUT_OF_REACH,
@@ -86,6 +86,7 @@ class ViewReader:
         config: parameter file for recordings, or None.
         dataset: of the recordings, or auto.
         warn: called once per distinct warning.
+        method: name of the embedder, which refuses views without what it reads; "": of no known one.
 
     Attributes:
         calibrated: whether files have a calibration.
@@ -102,8 +103,9 @@ class ViewReader:
         config: Path | None = None,
         dataset: str = "auto",
         warn: Callable[[str], None] = lambda _: None,
+        method: str = "",
     ) -> None:
-        self._embedder = embedder
+        self._embedder, self._method = embedder, method
         self._bin_columns, self._config, self._dataset = bin_columns, config, dataset
         self._warn = cache(warn)
         self.calibrated = calibration is not None
@@ -159,6 +161,7 @@ class ViewReader:
             names = ["", ""]
         left, right = (fit_image(read_image(Path(name)), self._calibration) if name else None for name in names)
         frame = make_snapshot(cloud, left, right, self._calibration, warn=self._warn)
+        self._check(view, frame)
         keyframe = make_keyframe(frame, self._embedder)
         if not view.left and not len(keyframe.points):
             raise SensorFileError(f"{view.scan} has {OUT_OF_REACH}")
@@ -179,9 +182,15 @@ class ViewReader:
         along.read_on(frames)
         for one, frame in zip(wanted, found, strict=True):
             try:
-                self._cache[one] = frame if isinstance(frame, UmfError) else along.seen_at(frame, self._embedder)
+                if isinstance(frame, UmfError):
+                    raise frame
+                self._check(one, frame)
+                self._cache[one] = along.seen_at(frame, self._embedder)
             except UmfError as error:
                 self._cache[one] = error
+
+    def _check(self, view: PlaceView, frame: Frame) -> None:
+        check_inputs(self._method, view.scan or view.left, frame.left is not None, frame.points is not None)
 
 
 class _ScansOnPath:

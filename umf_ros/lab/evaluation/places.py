@@ -16,7 +16,7 @@ from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.core.frames import Frame, Image, Points, StereoCamera
 from umf_ros.core.geometry import transform
 from umf_ros.core.io import read_yaml
-from umf_ros.embedding import Embedder, make_embedder
+from umf_ros.embedding import Embedder, check_inputs, make_embedder
 from umf_ros.lab.evaluation.results import EvaluationReport, Figures, Scores, TextTable, percent, rounded, score
 from umf_ros.lab.evaluation.retrieval import Mask, PlaceCollection, RetrievalTask, rank, rerank_all
 from umf_ros.lab.scan_files import SUFFIXES, read_scan
@@ -263,6 +263,7 @@ def evaluate_place_sets(listing: Path, settings: Settings, report: Callable[[str
     results = []
     for places in sets:
         report(places.name)
+        check_inputs(settings.embedding.method, f"the set {places.name}", places.kind == "image", places.kind == "scan")
         results.append(score_places(places, embedder, settings.verification))
     figures = {name: value for found in results for name, value in found.flat.items()}
     notes = [f"{listing}, embedded by {embedder.name}. A match is true where the set says so."]

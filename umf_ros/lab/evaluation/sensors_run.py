@@ -16,12 +16,14 @@ from rich.console import Console
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
+from umf_ros.bags.sensor_check import SensorReport
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.errors import UmfError
 from umf_ros.core.tasks import spread
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.evaluation.results import TextTable
 from umf_ros.replay import Replay
+from umf_ros.runs.findings import about_sensors
 from umf_ros.runs.reader import read_run, remember_recording
 from umf_ros.runs.report import finish_run, judge
 from umf_ros.runs.run_file import read_odometry_of
@@ -35,6 +37,22 @@ SENSORS: dict[str, dict[str, Any]] = {
     "camera alone": {"topics__cloud": _NOTHING},
 }
 """Settings that leave a sensor out, as `load_settings` takes them."""
+
+
+def describe_sensors(seen: SensorReport) -> list[str]:
+    """Return the findings about the sensors, or the properties that are right; and those that were not measured."""
+    by_motion = [one for one in (seen.lidar, seen.camera) if one is not None]
+    measured = {
+        "light": not np.isnan([seen.left_contrast, seen.right_contrast]).all(),
+        "clocks": bool(by_motion) or seen.overlay is not None,
+        "mountings": any(one.mounting_deg is not None for one in by_motion) or seen.overlay is not None,
+        "baseline": seen.overlay is not None,
+    }
+    right, unknown = ([name for name, known in measured.items() if known is wanted] for wanted in (True, False))
+    told = [one.line for one in about_sensors(seen)]
+    if right and not told:
+        told = [f"nothing is wrong with {', '.join(right)}"]
+    return [*told, f"could not be measured: {', '.join(unknown)}"] if unknown else told
 
 
 @dataclass(frozen=True, slots=True)

@@ -108,6 +108,7 @@ class LiveGraph:
 
     Attributes:
         seconds_to_stop: of each node, once they have ended.
+        interrupted: whether Ctrl-C ended it.
     """
 
     def __init__(self, folder: Path, console: Console, config: Path | None = None) -> None:
@@ -116,6 +117,7 @@ class LiveGraph:
         self._console = console
         self._nodes: list[NodeProcess] = []
         self.seconds_to_stop: dict[str, float] = {}
+        self.interrupted = False
 
     @property
     def is_running(self) -> bool:
@@ -141,10 +143,10 @@ class LiveGraph:
         with self._console.status("Finishing"):
             self._stop_all()
             settle_left(self._folder)
-        if kind is KeyboardInterrupt:
+        self.interrupted = kind is KeyboardInterrupt
+        if self.interrupted:
             self._console.print("[yellow]Interrupted: the report covers what was done so far.")
-            return True
-        return False
+        return self.interrupted
 
     def play(self, bag: Path, duration_s: float, rate: float) -> None:
         """Play the bag to its end, showing progress and what the nodes say.
