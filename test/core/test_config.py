@@ -29,6 +29,11 @@ def test_a_plain_file_and_a_ros_parameter_file_say_the_same(tmp_path: Path) -> N
     assert load_settings(plain).loop.top_k == 7
 
 
+@pytest.mark.parametrize("text", ["loop.top_k: 7", "loop.top_k: 7\nloop: {min_travel_m: 3}"])
+def test_names_of_a_plain_file_may_have_dots(tmp_path: Path, text: str) -> None:
+    assert load_settings(write(tmp_path / "a.yaml", text)).loop.top_k == 7
+
+
 def test_whole_numbers_pass_for_floats(tmp_path: Path) -> None:
     settings = load_settings(write(tmp_path / "a.yaml", "loop: {min_time_gap_s: 50}"))
     assert settings.loop.min_time_gap_s == 50.0 and isinstance(settings.loop.min_time_gap_s, float)

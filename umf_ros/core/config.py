@@ -360,7 +360,7 @@ def dump_settings(settings: Settings) -> str:
 def nest(flat: dict[str, Any]) -> dict[str, Any]:
     """Return `{"a.b": 1}` as `{"a": {"b": 1}}`."""
     nested: dict[str, Any] = {}
-    for name, value in flat.items():
+    for name, value in sorted(flat.items(), key=lambda one: one[0].count(".")):  # a group never replaces its values
         _set(nested, name.split("."), value)
     return nested
 
@@ -374,10 +374,10 @@ def _set(values: dict[str, Any], path: list[str], value: Any) -> None:
 
 
 def _node_parameters(content: dict[str, Any], path: str | Path) -> dict[str, Any]:
-    """Return the settings in a ROS parameter file; a plain file is returned as it is."""
+    """Return the settings in a ROS parameter file, or in a plain one; both may have dotted names."""
     blocks = [block for block in content.values() if isinstance(block, dict) and "ros__parameters" in block]
     if not blocks:
-        return content
+        return nest(content)
     if len(blocks) != len(content):
         raise ConfigError(f"{path}: mixes node parameters with plain settings")
     flat: dict[str, Any] = {}
