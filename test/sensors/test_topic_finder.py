@@ -116,6 +116,22 @@ def test_a_node_waits_until_nothing_new_is_announced() -> None:
     assert found is not None and found.topics.cloud == "/velodyne_points"
 
 
+@pytest.mark.parametrize(
+    ("wanted", "types"),
+    [
+        (FRONT_END, {"/map_node/map_cloud": CLOUD}),
+        (FRONT_END, {"/pose_graph_node/map_cloud": CLOUD, "/odom": ODOMETRY}),
+        (FRONT_END, {"/camera/depth/image_rect": IMAGE}),
+        (BACK_END, {"/loop_closures": ODOMETRY}),
+    ],
+)
+def test_a_node_waits_for_sensors_beside_topics_that_are_none(wanted: tuple[str, ...], types: dict[str, str]) -> None:
+    finder = TopicFinder(Settings(), "/", wanted)
+    assert all(finder.look(types, seconds) is None for seconds in (0.0, 60.0, 120.0))
+    assert finder.look(types | ROVER, 121.0) is None
+    assert finder.look(types | ROVER, 125.0) is not None
+
+
 def test_a_node_in_a_namespace_takes_the_topics_of_its_robot_alone() -> None:
     robots = {f"/{robot}{topic}": kind for robot in ("red", "blue") for topic, kind in ROVER.items()}
     found = TopicFinder(Settings(), "/red", FRONT_END).look(robots, 0.0, 0.0)

@@ -54,13 +54,17 @@ def _cameras(images: Mapping[str, str]) -> dict[str | None, str]:
     found: dict[str | None, tuple[int, bool, str]] = {}
     for topic, kind in images.items():
         namespace, _, name = topic.removesuffix("/compressed").rpartition("/")
-        if any(word in topic.lower() for word in _NO_PICTURES):
+        if not _is_picture(topic):
             continue
         usual = name in _IMAGES
         camera = namespace if usual else f"{namespace}/{name}"
         best = _IMAGES.index(name) if usual else 0, kind == COMPRESSED, topic
         found[camera] = min(best, found.get(camera, best))
     return {camera: topic for camera, (*_, topic) in found.items()}
+
+
+def _is_picture(image: str) -> bool:
+    return not any(word in image.lower() for word in _NO_PICTURES)
 
 
 def _info(image: str) -> str:
@@ -139,10 +143,11 @@ class TopicFinder:
             ConfigError: several topics fit.
         """
         prefix = f"{self._namespace}/"
-        seen = {topic: kind for topic, kind in types.items() if topic.startswith(prefix)}
+        # the map's cloud has the type of a scan, and is there before any sensor
+        seen = {topic: kind for topic, kind in types.items() if topic.startswith(prefix) and not is_own(topic)}
         if seen != self._seen:
             self._seen, self._since_s = seen, now_s
-        if now_s - self._since_s < settling_s or not self._suffices(set(seen.values())):
+        if now_s - self._since_s < settling_s or not self._suffices(seen):
             return None
         dataset = known_dataset([topic.removeprefix(self._namespace) for topic in seen])
         # images of that name are usual: live, the scans have to be the data set's too
@@ -150,9 +155,14 @@ class TopicFinder:
             return self._settings.model_copy(update={"dataset": dataset})
         return with_topics(self._settings, seen, self._wanted)
 
-    def _suffices(self, kinds: set[str]) -> bool:
+    def _suffices(self, seen: Mapping[str, str]) -> bool:
+        """Whether there is anything to work with: a scan or an image, where one is wanted."""
         names = [name for name in ("cloud", "left_image") if name in self._wanted] or self._wanted
-        return any(kinds.intersection(TYPES[name]) for name in names)
+        return any(
+            kind in TYPES[name] and (name == "cloud" or _is_picture(topic))
+            for name in names
+            for topic, kind in seen.items()
+        )
 
 
 def describe_inputs(settings: Settings, wanted: Collection[str] = FRONT_END) -> str:
