@@ -247,7 +247,7 @@ class PlaceIndex:
     """
 
     def __init__(self, dimension: int) -> None:
-        with one_thread() as faiss:
+        with _one_thread() as faiss:
             half = faiss.ScalarQuantizer.QT_fp16
             self._flat = self._index = faiss.IndexScalarQuantizer(dimension, half, faiss.METRIC_INNER_PRODUCT)
 
@@ -261,7 +261,7 @@ class PlaceIndex:
 
     def add(self, descriptors: Points) -> None:
         """Append (N, D) descriptors."""
-        with one_thread():
+        with _one_thread():
             self._index.add(np.ascontiguousarray(descriptors, np.float32))
 
     def compress(self) -> None:
@@ -269,7 +269,7 @@ class PlaceIndex:
         if not self.is_exact or len(self) <= EXACT_UP_TO:
             return
         size = min(DIRECTIONS, self._flat.d)
-        with one_thread() as faiss:
+        with _one_thread() as faiss:
             sample = self.descriptors(evenly(len(self), SAMPLE))
             # principal axes without centring, unlike those of faiss.PCAMatrix: it would change the order of products
             axes = np.linalg.eigh(sample.T @ sample)[1][:, -size:]
@@ -293,30 +293,32 @@ class PlaceIndex:
         A large index is searched through its shortlist; exhaustively where too few of it are admissible, or if `exact`.
         """
         if not (exact or self.is_exact):
-            with one_thread():
+            with _one_thread():
                 _, found = self._index.search(descriptor[None], min(SHORTLIST, len(self)))
             rows: Rows = found[0][found[0] >= 0]
             rows = rows[admissible(rows)]
             if len(rows) >= count:
                 return rows[:count]
-        if not len(self):
-            return np.empty(0, np.intp)
-        with one_thread() as faiss:
-            selector = faiss.IDSelectorBitmap(np.packbits(admissible(slice(None)), bitorder="little"))
-            rules = faiss.SearchParameters(sel=selector)
-            _, found = self._flat.search(descriptor[None], min(count, len(self)), params=rules)
+        _, found = self.nearest(descriptor[None], count, admissible(slice(None)))
         return np.asarray(found[0][found[0] >= 0])
+
+    def nearest(self, descriptors: Points, count: int, admissible: Mask) -> tuple[Points, Rows]:
+        """Return similarities and rows (Q, K <= count) of the admissible ones, best first; -1 where there are none."""
+        with _one_thread() as faiss:
+            rules = faiss.SearchParameters(sel=faiss.IDSelectorBitmap(np.packbits(admissible, bitorder="little")))
+            similarities, rows = self._flat.search(descriptors, max(min(count, len(self)), 1), params=rules)
+        return similarities, rows
 
     def save(self, path: Path) -> None:
         """Write the index to a file for `load`."""
-        with atomic_write(path, RuntimeError) as part, one_thread() as faiss:
+        with atomic_write(path, RuntimeError) as part, _one_thread() as faiss:
             faiss.write_index(self._index, str(part))
 
     @classmethod
     def load(cls, path: Path, dimension: int) -> PlaceIndex | None:
         """Return the index in a file; None where it has none of this kind and dimension."""
         index = cls(dimension)
-        with one_thread() as faiss:
+        with _one_thread() as faiss:
             try:
                 stored = faiss.read_index(str(path))
             except Exception as error:  # damaged bytes raise any exception
@@ -330,7 +332,7 @@ class PlaceIndex:
 
 
 @contextmanager
-def one_thread() -> Iterator[Any]:
+def _one_thread() -> Iterator[Any]:
     """Run FAISS on the calling thread only: waiting OpenMP threads would take cores from the network."""
     import faiss
 

@@ -125,8 +125,7 @@ class KeyframeStore:
         statement = f"SELECT id, descriptor FROM keyframe WHERE id IN ({','.join('?' * len(ids))})"
         with self._reading() as connection:
             blobs = dict(connection.execute(statement, ids))
-            content = b"".join(blobs[one] for one in ids)
-            return np.frombuffer(content, np.float32).reshape(len(ids), self._dimension)
+            return np.frombuffer(b"".join(blobs[one] for one in ids), np.float32).reshape(-1, self._dimension)
 
     def rows_at(self, stamp_ns: int) -> list[int]:
         """Return indices of the keyframes of a stamp, in order."""
@@ -182,9 +181,8 @@ class KeyframeStore:
 
     def delivered(self, rows: Sequence[int]) -> None:
         """Remove keyframes that the fleet's server has from the outbox."""
-        ids = [(one,) for one in self.keys["id"][list(rows)].tolist()]
         with self._lock, self._file.writing() as connection:
-            connection.executemany("DELETE FROM outbox WHERE id = ?", ids)
+            connection.executemany("DELETE FROM outbox WHERE id = ?", self.keys["id"][list(rows)][:, None].tolist())
 
     def save(self, path: Path) -> None:
         """Write a copy to `path` while the store stays in use."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.geometry import Array
-from umf_ros.places.database import one_thread
+from umf_ros.places.database import PlaceIndex
 from umf_ros.verification import constants as const
 from umf_ros.verification.keypoints import DESCRIPTOR, Keypoints, common_keypoints
 
@@ -24,9 +24,7 @@ class KeypointIndex:
     """
 
     def __init__(self, submaps: Mapping[int, Keypoints]) -> None:
-        with one_thread() as faiss:
-            half = faiss.ScalarQuantizer.QT_fp16
-            self._index = faiss.IndexScalarQuantizer(DESCRIPTOR, half, faiss.METRIC_INNER_PRODUCT)
+        self._index = PlaceIndex(DESCRIPTOR)
         self.rows: list[int] = []
         self._firsts = [0]
         self._positions: list[Array] = []
@@ -38,10 +36,9 @@ class KeypointIndex:
 
     def add(self, row: int, keypoints: Keypoints) -> None:
         """Add the keypoints (K, 130) of a submap."""
-        with one_thread():
-            self._index.add(np.ascontiguousarray(keypoints[:, 2:]))
+        self._index.add(keypoints[:, 2:])
         self.rows.append(row)
-        self._firsts.append(self._index.ntotal)
+        self._firsts.append(len(self._index))
         self._positions.append(keypoints[:, :2].copy())
 
     def most_alike(self, query: Keypoints, admissible: NDArray[np.bool_]) -> list[int]:
@@ -60,8 +57,8 @@ class KeypointIndex:
         return [row for row in sorted(counts, key=lambda row: -counts[row]) if counts[row]]
 
     def _keypoints(self, number: int) -> Keypoints:
-        first, last = self._firsts[number : number + 2]
-        found: Keypoints = np.hstack([self._positions[number], self._index.reconstruct_n(first, last - first)])
+        descriptors = self._index.descriptors(np.arange(*self._firsts[number : number + 2]))
+        found: Keypoints = np.hstack([self._positions[number], descriptors])
         return found
 
     def _votes(self, query: Keypoints, admissible: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -69,10 +66,7 @@ class KeypointIndex:
         known = np.repeat(admissible, np.diff(self._firsts))
         kept, votes = min(const.KEYPOINT_VOTES, int(known.sum()) - 1), np.zeros((len(query), len(self)), np.float32)
         if len(query) >= const.MIN_KEYPOINTS and kept > 0:
-            with one_thread() as faiss:
-                selector = faiss.IDSelectorBitmap(np.packbits(known, bitorder="little"))
-                rules = faiss.SearchParameters(sel=selector)
-                value, found = self._index.search(np.ascontiguousarray(query[:, 2:]), kept + 1, params=rules)
+            value, found = self._index.nearest(np.ascontiguousarray(query[:, 2:]), kept + 1, known)
             owner = np.searchsorted(self._firsts, found, side="right") - 1
             np.maximum.at(votes, (np.arange(len(votes))[:, None], owner), value - value.min(axis=1, keepdims=True))
         total: NDArray[np.float32] = votes.sum(axis=0)
