@@ -30,7 +30,7 @@ from umf_ros.embedding.runtimes import (
     outputs_of,
 )
 from umf_ros.lab.training.networks import save_weights
-from umf_ros.networks.config import XFEAT_OUTPUTS, locate_weights
+from umf_ros.networks.config import XFEAT_OUTPUTS, locate_weights, read_config
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
 
@@ -73,6 +73,21 @@ def test_torch_runtime_gives_the_outputs_of_the_network(network, tmp_path):
     np.testing.assert_allclose(found["cloud_saliency"], wanted.cloud.saliency[0].detach(), atol=1e-6)
     np.testing.assert_allclose(found["super_image_strength"], wanted.super_image.strength[0].detach(), atol=1e-5)
     assert {values.dtype for values in found.values()} == {np.dtype(np.float32)}
+
+
+def test_half_precision_of_a_gpu_changes_descriptors_little():
+    """The same code on the CPU, as a GPU would run it; its descriptors have another name."""
+    config = read_config(locate_weights(None))
+    image = np.random.default_rng(0).normal(size=config.image_size).astype(np.float32)
+    umf = pack([image], [prepare_scan(some_scan(0), None, config)], config)
+    for weights, outputs, inputs in (locate_weights(None), OUTPUTS, umf), (XFEAT, XFEAT_OUTPUTS, [IMAGE]):
+        runtime = TorchRuntime(weights, outputs, "cpu", 1)
+        single, name = runtime.run(inputs)[outputs[0]], name_outputs(weights, runtime)
+        runtime.precision = "float16"
+        half = runtime.run(inputs)[outputs[0]]
+        assert half.dtype == np.float32 and not np.array_equal(half, single)
+        assert (half * single).sum() / np.linalg.norm(half) / np.linalg.norm(single) > 0.999
+        assert name_outputs(weights, runtime) == name.replace("-", "-float16-")
 
 
 def test_only_requested_outputs_are_computed():

@@ -108,6 +108,6 @@ def test_a_pose_ranks_by_what_both_scans_should_see() -> None:
     """A quarter of either scan is common; at the right pose all of that has a counterpart."""
     points = boulders(0)
     match, query = seen(points, -14, 3, 0, 1), seen(points, -1, 17, 5, 1)
-    right = coarse_align(match, query, make_pose(np.eye(3), [5.0, 0.0, 0.0]))
-    wrong = coarse_align(match, query, make_pose(np.eye(3), [-9.0, 0.0, 0.0]))
+    right = coarse_align(match, query, [make_pose(np.eye(3), [5.0, 0.0, 0.0])])[0]
+    wrong = coarse_align(match, query, [make_pose(np.eye(3), [-9.0, 0.0, 0.0])])[0]
     assert right.share > 0.8 and right.score > wrong.score

@@ -94,7 +94,7 @@ def test_scouting_draws_a_rough_pose_to_the_match() -> None:
     there, here = standing(0, 0, 0), standing(1, 0.5, 30)
     true = relative(there, here)
     rough = true @ make_pose(Rotation.from_rotvec([0, 0, 0.04]).as_matrix(), [0.3, -0.3, 0.1])
-    fit = coarse_align(yard(6, there), yard(6, here), rough)
+    fit = coarse_align(yard(6, there), yard(6, here), [rough])[0]
     assert missed_by(true, fit.pose)[0] < 0.5 * missed_by(true, rough)[0]
 
 

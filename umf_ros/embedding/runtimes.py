@@ -81,7 +81,7 @@ class OpenVinoRuntime:
 
 
 class TorchRuntime:
-    """Torch in single precision, imported when it is used.
+    """Torch, imported when it is used; half precision on a GPU, single precision on a CPU.
 
     Args:
         weights: file of the UMF network, or for `XFEAT_OUTPUTS` of XFeat.
@@ -89,12 +89,14 @@ class TorchRuntime:
         device: torch device.
         threads: number of CPU threads.
 
+    Attributes:
+        precision: "float32" or "float16".
+        file: the outputs depend on its content.
+
     Raises:
         WeightsError: the weights cannot be used.
         ConfigError: torch does not support the device.
     """
-
-    precision = "float32"
 
     def __init__(self, weights: Path, outputs: tuple[str, ...], device: str, threads: int) -> None:
         import torch
@@ -112,10 +114,12 @@ class TorchRuntime:
             self._network = network.eval().to(self._device)
         except (RuntimeError, AssertionError) as error:
             raise ConfigError(f"embedding.device: cannot use {device!r}: {str(error).splitlines()[0]}") from None
+        self.precision = "float32" if self._device.type == "cpu" else "float16"
 
     def run(self, inputs: Arrays) -> Outputs:
         """Return the outputs of a batch of one by name, without the batch axis."""
-        with self._torch.inference_mode():
+        half = self._torch.autocast(self._device.type, self._torch.float16, enabled=self.precision == "float16")
+        with self._torch.inference_mode(), half:
             found = self._network(*(self._torch.from_numpy(array).to(self._device) for array in inputs))
         values = (value[0].float().cpu().numpy() for value in found)
         return dict(zip(self._outputs, values, strict=True))

@@ -83,33 +83,40 @@ def search(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
     theirs, ours = match.map(turned.map.cell_m), turned.map
     if not len(wanted) or min(len(theirs.rows), len(ours.rows)) < const.FEWEST_POINTS:
         return []
-    fits = []
     correlation, peaks = _correlate(theirs.spectra, turned.spectra(wanted), theirs.side), const.PEAKS
     if submaps(match, turned.scan):
         peaks = const.SUBMAP_PEAKS
         variance = np.maximum(_correlate(theirs.squared_spectra, turned.spectra(wanted, 2), theirs.side), 1e-12)
         correlation /= np.sqrt(variance + const.LEAST_CHANCE * variance.max(axis=(1, 2, 3), keepdims=True))
-    for index, shift in _peaks(correlation, wanted, peaks, ours.cell_m):
-        guess = lifted(match, turned.scan, float(const.ALL_HEADINGS[index]), shift)
-        fits.append(coarse_align(match, turned.scan, guess))
+    best = _peaks(correlation, wanted, peaks, ours.cell_m)
+    guesses = [lifted(match, turned.scan, float(const.ALL_HEADINGS[index]), shift) for index, shift in best]
+    fits = coarse_align(match, turned.scan, guesses)
     return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
 
 
-def coarse_align(match: PreparedScan, query: PreparedScan, guess: Array) -> Fit:
-    """Refine a pose by a few points, and count how many of them find a counterpart."""
-    pose = _by_scouts(match, query, guess)
+def coarse_align(match: PreparedScan, query: PreparedScan, guesses: Sequence[Array]) -> list[Fit]:
+    """Refine poses by a few points, and count how many of them find a counterpart."""
+    poses = [_by_scouts(match, query, guess) for guess in guesses]
     reach_m = const.SCOUT_NEAR * query.cell_m
-    ways = (match, transform(pose, query.scouts)), (query, transform(invert(pose), match.scouts))
-    shares = [_found_share(scan, points, reach_m) for scan, points in ways]
-    terrain = terrain_fit(match.terrain, query.terrain, levelled(match, query, pose))[1]
-    return Fit(pose, sum(shares) / 2, terrain, structured(match, query))
+    there = _found_shares(match, [transform(pose, query.scouts) for pose in poses], reach_m)
+    back = _found_shares(query, [transform(invert(pose), match.scouts) for pose in poses], reach_m)
+    known = structured(match, query)
+    fits = []
+    for pose, share in zip(poses, (there + back) / 2, strict=True):
+        terrain = terrain_fit(match.terrain, query.terrain, levelled(match, query, pose))[1]
+        fits.append(Fit(pose, float(share), terrain, known))
+    return fits
 
 
-def _found_share(scan: PreparedScan, points: Array, reach_m: float) -> float:
-    """Of the points (N, 3) that a scan should see, the share that it has within a reach; less where these are few."""
-    seen = visible(scan.look_at(points))
-    close = scan.nearest(points)[1] < reach_m**2
-    return float((seen & close).sum()) / max(int(seen.sum()), const.FEWEST_POINTS)
+def _found_shares(scan: PreparedScan, sets: list[Array], reach_m: float) -> Array:
+    """Of each set of points (N, 3) that a scan should see, the share within a reach of its own; less of few points."""
+    if not sets:
+        return np.empty(0)
+    points = np.concatenate(sets)
+    seen = visible(scan.look_at(points)).reshape(len(sets), -1)
+    close = (scan.nearest(points)[1] < reach_m**2).reshape(len(sets), -1)
+    shares: Array = (seen & close).sum(axis=1) / np.maximum(seen.sum(axis=1), const.FEWEST_POINTS)
+    return shares
 
 
 def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
@@ -208,8 +215,9 @@ def find_hypotheses(
     if guess is None and submaps(match, turned.scan):
         count, turn, shift = common_keypoints(turned.scan.keypoints, match.keypoints)
         guess = lifted(match, turned.scan, turn, shift) if count else None
-    if guess is not None and (fit := coarse_align(match, turned.scan, guess)).telling:
-        fits.insert(0, replace(fit, share=1.0))  # submaps that share little would not rank it first
+    for fit in coarse_align(match, turned.scan, [] if guess is None else [guess]):
+        if fit.telling:
+            fits.insert(0, replace(fit, share=1.0))  # submaps that share little would not rank it first
     distinct: list[Fit] = []
     for fit in fits:
         if not any(same_pose(fit.pose, other.pose) for other in distinct):
