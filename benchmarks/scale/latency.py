@@ -27,12 +27,14 @@ from nav_msgs.msg import OccupancyGrid, Odometry
 from sensor_msgs.msg import PointCloud2
 
 from umf_ros.core.config import Settings, topics_of
+from umf_ros.core.errors import UmfError
 from umf_ros.lab.live.live_graph import NODES, PLAYER, WHOLE, NodeProcess
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, closure_from_message, from_time, sensor_qos
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "robustness"))
 
 from endurance_graph import Figures, live, one_by_one
+from endurance_nodes import own_domain
 
 NAMES = {
     "live_stall_ms_20k": "executor's longest stall, ms",
@@ -99,12 +101,12 @@ def closures_of(bag: Path, folder: Path, modules: tuple[str, ...]) -> tuple[list
 
 def with_and_without_map(bag: Path, folder: Path) -> None:
     """Print the latency of closures with the map and without."""
-    rclpy.init()
     for name, modules in (("without map_node", NODES), ("with map_node", (*NODES, "umf_ros.nodes.map_node"))):
         closures, maps = closures_of(bag, folder, modules)
+        if not closures:
+            raise UmfError(f"{name}: this process heard no closure")
         p50, p95 = np.percentile(closures, [50, 95])
         print(f"{name:18s} scan to closure, ms: p50 {p50:6.1f}, p95 {p95:6.1f}; {len(closures)} closures, {maps} grids")
-    rclpy.shutdown()
 
 
 def main() -> None:
@@ -119,7 +121,7 @@ def main() -> None:
         print(f"umf replay to the first keyframe, s: {seconds}")
         return
     if arguments.bag is not None:
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory() as folder, own_domain():
             with_and_without_map(arguments.bag, Path(folder))
         return
     poses = 2_000 if arguments.quick else arguments.poses
