@@ -1,4 +1,4 @@
-"""Time of the two networks in their shipped precision, or on a GPU, beside single precision, and the outputs' cosines."""
+"""Time of both networks in their shipped precision or on a GPU, beside single precision, and how alike both are."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def main(
     device: Annotated[str, typer.Option(help="cuda compares a GPU in half precision with torch on the CPU.")] = "cpu",
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
 ) -> None:
-    """Run both networks in both precisions, on one thread of the CPU; what else runs on the machine slows both alike."""
+    """Run both networks in both precisions, on one thread of a CPU; what else runs on the machine slows both alike."""
     seeds = range(VALIDATION.start, VALIDATION.start + worlds)
     frames = [frame for frame in rendered_frames(frames_folder, seeds, print) if frame.left is not None]
     frames = [frame for frame in frames if frame.points is not None]

@@ -122,6 +122,17 @@ def test_without_openvino_torch_runs_the_same_weights(monkeypatch):
         xfeat(XFEAT, "openvino")
 
 
+def test_what_is_not_a_convolution_keeps_its_precision():
+    """In eight bits, the norm was cut off for an image alone or a strange one, whose parts are longer."""
+    config, rng = read_config(locate_weights(None)), np.random.default_rng(0)
+    runtime = make_runtime(locate_weights(None), settings("openvino"), ("descriptor",))
+    assert runtime.precision == "int8"
+    image = np.kron(rng.normal(size=(5, 7)), np.ones((32, 32))).astype(np.float32)
+    for left, points in (image, some_scan(0)), (image, np.empty((0, 3), np.float32)), (None, some_scan(0)):
+        found = runtime.run(pack([left], [prepare_scan(points, None, config)], config))["descriptor"]
+        assert np.linalg.norm(found) == pytest.approx(1, abs=1e-5)
+
+
 def test_a_model_of_other_weights_is_refused(copy):
     copy.write_bytes(copy.read_bytes() + b" ")
     with pytest.raises(WeightsError, match=r"xfeat.openvino was made from other weights; .* umf export"):

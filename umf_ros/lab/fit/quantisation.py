@@ -45,7 +45,8 @@ NOT_QUANTISED = (
     r".*voxel_encoder\.stem\.0.*",
     r".*voxel_encoder\.down\.0\.0.*",
     r".*voxel_encoder\.stem\.1\.0/aten::(minimum|sub|add).*",
-    # transformers and heads take as long in eight bits
+    # transformers, heads and what the network does itself, such as normalising descriptors, take as long in eight bits
+    r".*module\.network/.*",
     r".*scene\.projection.*",
     r".*network\.scene/.*",
     r".*voxel_encoder\.fine.*",
