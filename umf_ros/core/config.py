@@ -111,7 +111,7 @@ class EmbeddingSettings(Group):
         description="safetensors file; empty: umf_scene, or another method's own",
     )
     runtime: Literal["auto", "torch", "openvino"] = Field("auto", description="inference runtime")
-    device: str = Field("cpu", description="torch device")
+    device: str = Field("cpu", description="torch device; half precision on a GPU")
     threads: int = Field(0, ge=0, le=64, description="threads of each of the two networks; 0: half of the cores")
 
 
