@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from command_line import umf
 
 from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import invert, transform
@@ -88,3 +89,14 @@ def test_a_contact_sheet_shows_24_frames_and_6_scans(survey, tmp_path):
     assert sheet.shape == (4 * 256 + 416, 6 * 344, 3)
     tiles = sheet[: 4 * 256].reshape(4, 256, 6, 344, 3).astype(float).std(axis=(1, 3, 4))
     assert (tiles > 5).all()
+
+
+def test_worlds_are_simulated_at_once_and_existing_ones_are_kept(tmp_path):
+    command = ("simulate", "--shards", tmp_path, "--worlds", "3:5", "--every", "80")
+    assert umf(*command).status == 0
+    worlds = [tmp_path / f"world_0000{seed}.npz" for seed in (3, 4)]
+    one, other = (np.load(path)["images"] for path in worlds)
+    assert len(one) >= 2 and len(other) >= 2 and not np.array_equal(one[0], other[0])
+    written = [path.stat().st_mtime_ns for path in worlds]
+    assert umf(*command).status == 0
+    assert [path.stat().st_mtime_ns for path in worlds] == written

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,9 +13,7 @@ from umf_ros.core.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress
-
-    from umf_ros.lab.simulation.survey import Survey
+    from rich.progress import Progress, TaskID
 
 TWIN = "s3li-twin"
 USED = {
@@ -69,7 +68,7 @@ def command(
     ] = 1.0,
     fine: Annotated[bool, typer.Option("--fine", help="Render all pixels of s3li-twin's images.")] = False,
     contact_sheet: Annotated[Path | None, typer.Option(help="Write a PNG of 24 frames and 6 scans instead.")] = None,
-    workers: Annotated[int, typer.Option(min=1, max=64, help="Rendering threads.")] = 2,
+    workers: Annotated[int, typer.Option(min=1, max=64, help="Rendering threads; of --worlds, processes.")] = 2,
     ray: Annotated[
         str | None, typer.Option(help="Spread --shards by Ray: address of a cluster that sees their folder, or local.")
     ] = None,
@@ -105,11 +104,10 @@ def command(
         _write_twin(folder, seed, scale, sequences, fine, workers, console)
     elif contact_sheet is not None:
         _write_contact_sheet(contact_sheet, seed, family or "etna", console)
+    elif shards is not None and sequences:
+        _write_sequences(shards, sequences, seed, workers, console)
     elif shards is not None:
-        if ray is None:
-            _write_shards(shards, worlds, every, sequences, seed, workers, console)
-        else:
-            _spread_shards(shards, worlds, every, workers, ray, console)
+        _write_worlds(shards, worlds, every, workers, ray, console)
     elif out is not None:
         check_absent(out, out.with_suffix(".odometry.tum"), out.with_suffix(".pos"))
         write_drive(out, console, preset, (seed, world), duration, family, aliasing, image_rate, truth, workers)
@@ -175,41 +173,32 @@ def write_drive(
     console.print(f"{out}: {simulator.duration_s:.0f} s, {scans} scans, {size:.0f} MB", markup=False, soft_wrap=True)
 
 
-def _write_shards(
-    folder: Path, worlds: str, every: int, sequences: str, seed: int, workers: int, console: Console
-) -> None:
+def _write_sequences(folder: Path, sequences: str, seed: int, workers: int, console: Console) -> None:
     from umf_ros.lab.simulation.presets import SEQUENCES
-    from umf_ros.lab.simulation.survey import missing_worlds, seed_range, shard_plan, survey_world
+    from umf_ros.lab.simulation.survey import write_shard
 
+    if sequences not in SEQUENCES:
+        raise ConfigError(f"unknown sequences {sequences!r}; expected one of {', '.join(SEQUENCES)}")
     with _progress(console) as progress:
-        if sequences:
-            if sequences not in SEQUENCES:
-                raise ConfigError(f"unknown sequences {sequences!r}; expected one of {', '.join(SEQUENCES)}")
-            for name, survey in SEQUENCES[sequences](seed):
-                path = folder / f"{name}.npz"
-                if not path.exists():
-                    _write_shard(path, survey, "hard", workers, progress)
-            return
-        for path, world, _ in missing_worlds(folder, seed_range(worlds), every):
-            family, setting = shard_plan(world)
-            _write_shard(path, survey_world(world, family, setting, every=every), setting, workers, progress)
+        for name, survey in SEQUENCES[sequences](seed):
+            path = folder / f"{name}.npz"
+            if not path.exists():
+                task = progress.add_task(name, total=len(survey))
+                write_shard(path, survey, "hard", workers, partial(_advance, progress, task))
 
 
-def _spread_shards(folder: Path, worlds: str, every: int, workers: int, ray: str, console: Console) -> None:
+def _write_worlds(folder: Path, worlds: str, every: int, workers: int, ray: str | None, console: Console) -> None:
     from umf_ros.core.tasks import spread
     from umf_ros.lab.simulation.survey import missing_worlds, seed_range, write_world
 
     missing = missing_worlds(folder, seed_range(worlds), every)
     with _progress(console) as progress:
         task = progress.add_task("worlds", total=len(missing))
-        spread(write_world, missing, workers, ray, lambda done: progress.update(task, completed=done))
+        spread(write_world, missing, workers, ray, partial(_advance, progress, task))
 
 
-def _write_shard(path: Path, survey: Survey, setting: str, workers: int, progress: Progress) -> None:
-    from umf_ros.lab.simulation.survey import write_shard
-
-    task = progress.add_task(path.stem, total=len(survey))
-    write_shard(path, survey, setting, workers, lambda done: progress.update(task, completed=done))
+def _advance(progress: Progress, task: TaskID, done: int) -> None:
+    progress.update(task, completed=done)
 
 
 def _write_contact_sheet(path: Path, seed: int, family: str, console: Console) -> None:
