@@ -215,9 +215,9 @@ def find_hypotheses(
     if guess is None and submaps(match, turned.scan):
         count, turn, shift = common_keypoints(turned.scan.keypoints, match.keypoints)
         guess = lifted(match, turned.scan, turn, shift) if count else None
-    for fit in coarse_align(match, turned.scan, [] if guess is None else [guess]):
-        if fit.telling:
-            fits.insert(0, replace(fit, share=1.0))  # submaps that share little would not rank it first
+    if guess is not None:  # submaps that share little would not rank it first
+        expected = coarse_align(match, turned.scan, [guess])
+        fits = [replace(fit, share=1.0) for fit in expected if fit.telling] + fits
     distinct: list[Fit] = []
     for fit in fits:
         if not any(same_pose(fit.pose, other.pose) for other in distinct):
