@@ -127,14 +127,16 @@ def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int 
 def _misfits_with(scan: PreparedScan, planes: Surfaces, points: Array, poses: Array, sigma_m: float) -> Misfits:
     """Misfits of points (N, 3) with planes of a scan."""
     moved = at_poses(poses, points)
+    known = scan.look_at(moved) == Sight.PASSED
+    misfits, others = known.astype(float), np.flatnonzero(~known)
+    moved = moved[others]
     found, squared = planes.tree.batch_nearest_neighbor_search(moved, num_threads=1)
     index = np.asarray(found, np.intp)
     away = np.einsum("ij,ij->i", moved - planes.centres[index], planes.normals[index])
     sigmas = (away / sigma_m) ** 2
-    passed = scan.look_at(moved) == Sight.PASSED
-    close = planes.planar[index] & (np.asarray(squared) < planes.reach_m[index] ** 2)
-    shape = len(poses), len(points)
-    return np.where(passed, 1.0, sigmas / (1.0 + sigmas)).reshape(shape), (passed | close).reshape(shape)
+    misfits[others] = sigmas / (1.0 + sigmas)
+    known[others] = planes.planar[index] & (np.asarray(squared) < planes.reach_m[index] ** 2)
+    return misfits.reshape(len(poses), -1), known.reshape(len(poses), -1)
 
 
 def _means(misfits: Array, known: NDArray[np.bool_]) -> Array:
