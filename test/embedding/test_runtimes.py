@@ -122,7 +122,7 @@ def test_without_openvino_torch_runs_the_same_weights(monkeypatch):
         xfeat(XFEAT, "openvino")
 
 
-def test_what_is_not_a_convolution_keeps_its_precision():
+def test_the_norm_of_the_descriptor_keeps_its_precision():
     """In eight bits, the norm was cut off for an image alone or a strange one, whose parts are longer."""
     config, rng = read_config(locate_weights(None)), np.random.default_rng(0)
     runtime = make_runtime(locate_weights(None), settings("openvino"), ("descriptor",))

@@ -45,12 +45,9 @@ NOT_QUANTISED = (
     r".*voxel_encoder\.stem\.0.*",
     r".*voxel_encoder\.down\.0\.0.*",
     r".*voxel_encoder\.stem\.1\.0/aten::(minimum|sub|add).*",
-    # transformers, heads and what the network does itself, such as normalising descriptors, take as long in eight bits
-    r".*module\.network/.*",
-    r".*scene\.projection.*",
-    r".*network\.scene/.*",
     r".*voxel_encoder\.fine.*",
-    r".*network\.(fusion|cloud_local|image_local|super_|image_tokens|cloud_tokens|absent_).*",
+    # outside of the encoders nothing gets faster in eight bits, and the norm of the descriptor would be cut off
+    r".*module\.network(?!\.(image_encoder|voxel_encoder|scene\.trunk)\.).*",
 )
 XFEAT_NOT_QUANTISED = (r".*corners.*",)  # of the key points: a tenth of them moved by more than half a pixel
 SMALL_VALUES = 4.0
