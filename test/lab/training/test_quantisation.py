@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tiny_worlds import TINY
 from torch import nn
 
 from umf_ros.core.resources import find
@@ -23,7 +26,9 @@ from umf_ros.lab.fit.quantisation import (
     rendered_frames,
     save_model,
 )
+from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.config import XFEAT_OUTPUTS
+from umf_ros.networks.umf import UMF
 
 XFEAT = find("models/xfeat.safetensors")
 
@@ -76,6 +81,20 @@ def test_convolutions_are_quantised_but_for_those_named() -> None:
     found = quantise(model, inputs, (r".*module\.0/.*",), silent)
     quantised = [node.get_friendly_name() for node in found.get_ops() if node.get_type_name() == "FakeQuantize"]
     assert len(quantised) == 1 and "module.0/" not in quantised[0]
+
+
+def test_outside_of_the_encoders_nothing_is_quantised(worlds: Path) -> None:
+    weights = worlds / "tiny.safetensors"
+    save_weights(UMF(replace(TINY, scene=8)).eval(), weights, {})
+    model = export_model(weights, "int8", worlds, silent)
+    readers = [
+        port.get_node().get_friendly_name()
+        for node in model.get_ops()
+        if node.get_type_name() == "FakeQuantize"
+        for port in node.output(0).get_target_inputs()
+    ]
+    encoders = re.compile(r"__module\.network\.(image_encoder|voxel_encoder|scene\.trunk)\b")
+    assert len(readers) > 20 and all(map(encoders.match, readers))
 
 
 def test_an_exported_model_runs_beside_its_weights(worlds: Path) -> None:
