@@ -39,6 +39,25 @@ def test_a_closure_the_map_can_judge_is_accepted_at_once() -> None:
     assert verdict.residual < 5 and verdict.residual_m < 0.5
 
 
+def test_a_closure_that_agrees_waits_for_the_next_solution_and_others_are_judged_with_it() -> None:
+    agreeing = closing(two_laps(), lap_pairs(0, 15, 1), noise=1.0)
+    world = closing(agreeing, lap_pairs(2), shift_m=(0.0, 0.0, 1.5))
+    graph, solved = driven(world), driven(world)
+    for one in (graph, solved):
+        one.add_closures([world.message(0), world.message(1)])
+        one.settle()
+        before = one.trajectory()[1]
+        (verdict,) = one.add_closure(world.message(2))
+        assert verdict.reason == "agrees with the map"
+        assert (one.trajectory()[1] == before).all()
+    solved.update()
+    assert rms(solved.trajectory()[1], before) > 1e-3
+    (found,), (expected,) = graph.add_closure(world.message(3)), solved.add_closure(world.message(3))
+    assert found.state is expected.state is State.REJECTED
+    assert found.residual == pytest.approx(expected.residual, rel=0.01)
+    assert rms(graph.trajectory()[1], solved.trajectory()[1]) < 1e-3
+
+
 def test_an_unsure_closure_waits_for_other_places() -> None:
     world = closing(two_laps(), lap_pairs(0, 1, 15, 30, 45))
     graph = driven(world, stated=4.0)

@@ -22,8 +22,9 @@ from scipy.special import expit
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, adjoint, invert, logmap, propagate
+from umf_ros.core.table import Table
 from umf_ros.pose_graph.closures import CLOSURE, Closures
-from umf_ros.pose_graph.odometry import Rows, Table, noise_between
+from umf_ros.pose_graph.odometry import Rows, noise_between
 
 Loops = NDArray[np.void]
 LOOP = np.dtype([("residual", "f8", 6), ("odometry", "f8", (6, 6)), ("closures", "f8", (6, 6))])

@@ -72,7 +72,7 @@ class OutlierRejection:
         self._consistency = ConsistencyGraph(settings)
         self._estimator = NoiseScaleEstimator()
         self._map: RelativeCovariances | None = None
-        self._is_rough = False
+        self._is_rough = self._is_outdated = False  # outdated: without some accepted closures that agree with it
         self._ratios: list[float] = []  # likelihood of how closures fit the map if wrong over that if right
         self._joined: list[bool] = []  # whether the map joins both endpoints
         self._near_map: list[int] = []
@@ -108,7 +108,8 @@ class OutlierRejection:
     def consider(self, arrived: Sequence[PlacedClosure]) -> list[ClosureVerdict]:
         """Add closures; return the verdicts that are new or changed.
 
-        The map is solved once at most, roughly; closures near the moved map are compared by the next call.
+        The map is solved once or twice at most, roughly, and not for closures that agree with it alone; closures near
+        the moved map are compared by the next call.
         """
         before = list(self.verdicts)
         rows = [self._take(placed) for placed in arrived]
@@ -121,7 +122,7 @@ class OutlierRejection:
         return self._changed_since(before)
 
     def refine(self) -> None:
-        """Solve a map exactly that was solved roughly."""
+        """Solve a map exactly that was solved roughly, or without the closures that agreed with it."""
         if self._is_rough:
             self.solve()
 
@@ -184,23 +185,29 @@ class OutlierRejection:
         for _ in range(_MOST_ROUNDS):
             if not self._decide(rows):
                 return
+            if self._is_outdated:
+                self.solve(rough=True)
             rows = self._near_map
 
     def _decide(self, rows: Iterable[int]) -> bool:
-        """Decide about closures and solve the map with the accepted ones; return false without any."""
-        rows = sorted(rows)
-        agreed = self._gate(rows)
+        """Decide about closures and solve the map with the accepted ones; return false without any.
+
+        The map is not solved for closures that agree with it, until there is one that does not agree with it or with
+        those: its bounds hold without them, only wider, so that what they let pass is as safe.
+        """
+        rows, self._near_map = sorted(rows), []
+        agreed, accepted = self._gate(rows), self._of(State.ACCEPTED)
+        opposed = any(self._consistency.opponents(row, accepted) for row in agreed)
+        if self._is_outdated and (opposed or len(agreed) < (~accepted & ~self._revoked)[rows].sum()):
+            self.solve(rough=True)
+            agreed = self._gate(rows)
         supported = [member for found in self._supported_sets(rows, self._of(State.PENDING)) for member in found]
         supported += self._overrule(rows)
         reasons = dict.fromkeys(supported, ClosureReason.SUPPORTED) | dict.fromkeys(agreed, ClosureReason.AGREES)
         # only without other accepted closures: the map moved by those may contradict these
         if not reasons:
             reasons = dict.fromkeys(self._unopposed(), ClosureReason.UNOPPOSED)
-        self._near_map = []
-        if self._accept(reasons):  # closures not accepted that the moved map comes close to are compared again
-            rows = np.flatnonzero(~self._of(State.ACCEPTED) & ~self._revoked)
-            self._near_map = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
-        return bool(reasons)
+        return self._accept(reasons)
 
     def _take(self, placed: PlacedClosure) -> int:
         row = len(self.placed)
@@ -366,16 +373,24 @@ class OutlierRejection:
         """Accept closures and solve the map with them; return false without any."""
         for row, reason in reasons.items():
             self.verdicts[row] = replace(self.verdicts[row], state=State.ACCEPTED, reason=reason)
-        if reasons:
+        if all(reason is ClosureReason.AGREES and self._joined[row] for row, reason in reasons.items()):
+            self._is_outdated |= bool(reasons)
+            self._is_rough |= bool(reasons)
+        else:
             self.solve(rough=True)
         return bool(reasons)
 
     def solve(self, rough: bool = False) -> None:
-        """Solve the map with the accepted closures, or solve it roughly, which takes half the time."""
+        """Solve the map with the accepted closures, or solve it roughly, which takes half the time.
+
+        Closures not accepted that the moved map comes close to are compared again.
+        """
         self._is_rough = True  # also after an error
         self._sessions.solve(self.accepted, self.scale, rough)
-        self._is_rough = rough
+        self._is_rough, self._is_outdated = rough, False
         self._map = RelativeCovariances(self._sessions)
+        rows = np.flatnonzero(~self._of(State.ACCEPTED) & ~self._revoked)
+        self._near_map = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
 
     def _reject(self, row: int, reason: ClosureReason) -> None:
         self.verdicts[row] = ClosureVerdict(self.placed[row].closure, State.REJECTED, reason)

@@ -16,10 +16,11 @@ from umf_ros.core.geometry import Array
 
 _ANCHOR = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
 _MOST_STEPS = 30
-# radians and metres: the error after a step is below its square (0.75 m per rad^2 at 20,000 poses). A solution's is
-# below a micrometre, so that a map solved at once, as after a restart, equals the one solved closure by closure; that
-# of a rough solution is below a centimetre
-_SMALL, _ROUGH = 1e-3, 0.1
+# radians and metres, of all of a step: the error after it is below a micrometre, so that a map solved at once, as after
+# a restart, equals the one solved closure by closure
+_SMALL = 1e-3
+# rad m, of a step's largest rotation times its largest length: the error after it is below a tenth (at 20,000 poses)
+_ROUGH = 0.1
 _FEW_VERTICES = 300
 
 
@@ -88,7 +89,7 @@ class GraphSolver:
             factors.add(factor)
         ordering = _ordering(factors, [numbers[row] for row in graph.anchors], numbers)
         try:
-            self._tree, values = _descend(factors, values, ordering, _ROUGH if rough else _SMALL)
+            self._tree, values = _descend(factors, values, ordering, rough)
         except (RuntimeError, IndexError, ValueError) as error:
             self._factors = {}
             raise GraphError(f"the pose graph cannot be solved: {one_line(error)}") from None
@@ -139,7 +140,7 @@ def _ordering(factors: gtsam.NonlinearFactorGraph, anchors: list[int], numbers: 
 
 
 def _descend(
-    factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, last_step: float
+    factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, rough: bool
 ) -> tuple[gtsam.GaussianBayesTree | None, gtsam.Values]:
     """Solve by Gauss-Newton, or by Levenberg-Marquardt when a large step raises the error.
 
@@ -149,7 +150,8 @@ def _descend(
     tree = None
     for _ in range(_MOST_STEPS):
         tree, trial, delta = _step(factors, values, ordering)
-        small = np.abs(delta.vector()).max() < last_step
+        rotation, length = np.abs(delta.vector()).reshape(-1, 2, 3).max(axis=(0, 2))
+        small = max(rotation, length) < _SMALL or (rough and rotation * max(rotation, length) < _ROUGH)
         if not small and not factors.error(trial) <= factors.error(values) * (1 + 1e-9) + 1e-9:
             careful = _by_qr(gtsam.LevenbergMarquardtParams())
             values = gtsam.LevenbergMarquardtOptimizer(factors, values, careful).optimize()
