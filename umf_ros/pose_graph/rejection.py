@@ -108,8 +108,8 @@ class OutlierRejection:
     def consider(self, arrived: Sequence[PlacedClosure]) -> list[ClosureVerdict]:
         """Add closures; return the verdicts that are new or changed.
 
-        The map is solved once or twice at most, roughly, and not for closures that agree with it alone; closures near
-        the moved map are compared by the next call.
+        The map is solved twice at most, roughly, and not at all if every closure agrees with it; closures near the moved
+        map are compared by the next call.
         """
         before = list(self.verdicts)
         rows = [self._take(placed) for placed in arrived]
@@ -192,8 +192,8 @@ class OutlierRejection:
     def _decide(self, rows: Iterable[int]) -> bool:
         """Decide about closures and solve the map with the accepted ones; return false without any.
 
-        The map is not solved for closures that agree with it, until there is one that does not agree with it or with
-        those: its bounds hold without them, only wider, so that what they let pass is as safe.
+        Closures that agree with the map leave it as it is: its bounds hold without them, only wider. It is solved with
+        them once another closure does not agree with it, or contradicts one of them.
         """
         rows, self._near_map = sorted(rows), []
         agreed, accepted = self._gate(rows), self._of(State.ACCEPTED)
