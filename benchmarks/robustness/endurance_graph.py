@@ -16,8 +16,9 @@ from endurance_nodes import BACK_END, Ears, NodeUnderTest, own_domain
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
 
+from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.config import load_settings
-from umf_ros.core.geometry import Array
+from umf_ros.core.geometry import Array, from_enu
 from umf_ros.core.io import memory_mb
 from umf_ros.durable_graph import DurableGraph
 from umf_ros.graph_process import JOURNAL
@@ -28,6 +29,8 @@ from umf_ros.pose_graph.closures import ClosureReason, State
 
 Figures = dict[str, Any]
 SEED = 10005
+ORIGIN = np.array([37.72, 15.0, 2550.0])
+"""Latitude, longitude and height of the fixes' world."""
 SETTINGS = load_settings().pose_graph.model_copy(update={"max_gap_s": 3.0})
 BELIEVING = SETTINGS.model_copy(update={"reject_outliers": False})
 LATE = 40
@@ -63,25 +66,49 @@ def all_at_once(poses: int) -> Figures:
     return {"event_ms_20k": wall, "event_cpu_ms_20k": cpu} | spread("event_cpu_ms_20k", times[:, 1])
 
 
-def one_by_one(poses: int) -> Figures:
-    """Milliseconds of CPU at the end of a drive all of whose closures are in the map, and of the pose that follows."""
+def one_by_one(poses: int, fix_every_m: int = 0) -> Figures:
+    """Milliseconds of CPU at the end of a drive all of whose closures are in the map, and of the pose that follows.
+
+    Args:
+        poses: of the drive, a metre apart.
+        fix_every_m: metres between positions by GNSS; 0: none.
+    """
     world = rover_loops(poses, SEED)
     graph, first = PoseGraph(BELIEVING), world.closures[-LATE].second
-    for k in range(first):
-        graph.add_odometry(k * PERIOD_NS, world.odometry[k])
+    fixes = fixes_of(world, fix_every_m) if fix_every_m else {}
+
+    def drive_to(begin: int, end: int) -> None:
+        for k in range(begin, end):
+            graph.add_odometry(k * PERIOD_NS, world.odometry[k])
+            if k in fixes:
+                graph.add_absolute(fixes[k])
+
+    drive_to(0, first)
     graph.add_closures([world.message(row) for row in range(len(world.closures) - LATE)])
     graph.retune(SETTINGS)
     graph.update()
-    events, poses_ms, k = [], [], first
+    events, poses_ms, updates_ms, k = [], [], [], first
     for row in range(len(world.closures) - LATE, len(world.closures)):
-        while k <= world.closures[row].second:
-            graph.add_odometry(k * PERIOD_NS, world.odometry[k])
-            k += 1
+        drive_to(k, k := world.closures[row].second + 1)
+        updates_ms.append(timed(graph.update)[1])
         events.append(timed(partial(graph.add_closure, world.message(row)))[1])
         poses_ms.append(timed(lambda: (graph.map_T_odom(), graph.covariance()))[1])
     found = spread("drive_event_cpu_ms_20k", np.array(events[5:])) | spread("pose_cpu_ms_20k", np.array(poses_ms[5:]))
+    found |= spread("update_cpu_ms_20k", np.array(updates_ms[5:]))
     found["trajectory_cpu_ms_20k"] = round(timed(graph.trajectory)[1], 1)
     return found
+
+
+def fixes_of(world: GraphWorld, every_m: int) -> dict[int, AbsoluteMeasurement]:
+    """Positions by GNSS along a drive, by the number of their pose."""
+    rng, sigma_m = np.random.default_rng(SEED), 1.0
+    rows = range(0, len(world.truth), every_m)
+    measured = world.truth[::every_m, :3, 3] + rng.normal(0, sigma_m, (len(rows), 3))
+    covariance, lever = sigma_m**2 * np.eye(3), np.zeros(3)
+    return {
+        k: AbsoluteMeasurement(Aid.GNSS, k * PERIOD_NS, position, covariance, lever)
+        for k, position in zip(rows, from_enu(measured, ORIGIN), strict=True)
+    }
 
 
 def keep(world: GraphWorld, last: int, path: Path) -> int:

@@ -3,8 +3,9 @@
 `python benchmarks/scale/latency.py [--poses 20000] [--quick] [--start RECORDING] [--bag RECORDING]`
 
 A node resumes a stored graph and receives the last 40 closures over DDS, with odometry at 20 Hz: its executor's longest
-stall, the time from a closure to its verdict, memory and time to shut down. CPU times are of the graph alone. `--start`
-prints the times from `umf replay` to the first keyframe of a recording in its run folder, of three starts.
+stall, the time from a closure to its verdict, memory and time to shut down. CPU times are of the graph alone, and again
+with a position by GNSS every four metres. `--start` prints the times from `umf replay` to the first keyframe of a
+recording in its run folder, of three starts.
 
 `--bag`: a recording of the simulator is played to front-end and back-end, and again with `map_node` and its listener:
 time from a scan to the closures of its keyframe, at this process.
@@ -44,6 +45,11 @@ NAMES = {
     "verdicts_missing": "closures without a verdict",
     "shutdown_s_20k": "shutdown, s",
     "memory_mb_20k": "memory of the node, MB",
+}
+FIX_EVERY_M = 4
+NAMES_WITH_FIXES = {
+    "drive_event_cpu_ms_20k_p50_gnss": "CPU per closure, GNSS, ms, p50",
+    "drive_event_cpu_ms_20k_p95_gnss": "CPU per closure, GNSS, ms, p95",
 }
 
 
@@ -126,7 +132,9 @@ def main() -> None:
     poses = 2_000 if arguments.quick else arguments.poses
     with tempfile.TemporaryDirectory() as folder:
         figures: Figures = one_by_one(poses) | live(poses, Path(folder))
-    for name, text in NAMES.items():
+    aided = one_by_one(poses, FIX_EVERY_M)
+    figures |= {f"{name}_gnss": aided[name] for name in NAMES if name in aided}
+    for name, text in (NAMES | NAMES_WITH_FIXES).items():
         print(f"{text:32s} {figures[name]:8.1f}")
 
 

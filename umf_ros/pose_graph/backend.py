@@ -132,18 +132,18 @@ class PoseGraph:
         self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
 
     def update(self, exactly: bool = True) -> list[ClosureVerdict]:
-        """Decide about closures whose odometry has arrived, and solve the map exactly; return new verdicts."""
+        """Decide about measurements whose odometry has arrived, and solve the map exactly; return new verdicts."""
         verdicts = self._decide()
+        self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
         if exactly:
             self._attempt(self._rejection.refine)
         return verdicts
 
     def _decide(self) -> list[ClosureVerdict]:
+        """Decide about closures whose odometry has arrived."""
         self._refresh()
         refused, arrived = self._take_waiting()
-        verdicts = refused + self._attempt(lambda: self._rejection.consider(arrived))
-        self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
-        return verdicts
+        return refused + self._attempt(lambda: self._rejection.consider(arrived))
 
     def prepare(self, within_s: float) -> None:
         """Do part of the work of `settle` within a time limit; after a long mission it takes minutes."""
