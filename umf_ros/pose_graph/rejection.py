@@ -108,8 +108,8 @@ class OutlierRejection:
     def consider(self, arrived: Sequence[PlacedClosure]) -> list[ClosureVerdict]:
         """Add closures; return the verdicts that are new or changed.
 
-        The map is solved twice at most, roughly, and not at all if every closure agrees with it; closures near the moved
-        map are compared by the next call.
+        The map is solved twice at most, roughly, and not at all if every closure agrees with it. Closures near the
+        moved map are compared by the next call.
         """
         before = list(self.verdicts)
         rows = [self._take(placed) for placed in arrived]
