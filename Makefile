@@ -38,7 +38,7 @@ test-jazzy: .venv-jazzy/.installed
 	@test -x .venv-jazzy/bin/python || $(PYTHON) -m venv .venv-jazzy
 	@grep -hv '^-r' requirements-dev.txt requirements-lab.txt requirements-fleet.txt > .venv-jazzy/tools.txt
 	@./tools/install_torch.sh .venv-jazzy/bin/python $(TORCH_INDEX)
-	@.venv-jazzy/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-jazzy.txt \
+	@.venv-jazzy/bin/python -m pip install --quiet --disable-pip-version-check --use-pep517 -r requirements-jazzy.txt \
 		-r requirements-ros.txt -r .venv-jazzy/tools.txt
 	@.venv-jazzy/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch $@
@@ -65,7 +65,7 @@ $(VENV)/.installed: $(wildcard requirements*.txt) package.xml setup.py setup.cfg
 	@test -x $(BIN)/python || { echo "Making $(VENV) with $$($(PYTHON) --version)"; $(PYTHON) -m venv $(VENV); }
 	@./tools/install_torch.sh $(BIN)/python $(TORCH_INDEX)
 	@echo "Installing the requirements (one to three minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pep517 -r requirements-dev.txt
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch $@
 
