@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -143,3 +145,14 @@ def test_a_late_measurement_has_all_decided_again() -> None:
     track.judge(track.values, path, in_world=True)
     accepted = np.array([one.state is State.ACCEPTED for one in track.verdicts()])
     assert len(accepted) == 1500 and accepted[700:710][~lies[700:710]].all() and not accepted[lies].any()
+
+
+@pytest.mark.parametrize(("ahead_m", "is_right"), [(0.0, True), (1.8, False)])
+def test_an_antenna_is_judged_by_its_two_axes_in_the_plane(ahead_m: float, is_right: bool) -> None:
+    # 1.8 m is 14.3 here as squared Mahalanobis distance: beyond the gate of two axes, within that of three
+    track = Track(Aid.GNSS, OdometryNoise.stated(PoseGraphSettings()))
+    fixes, _, path = measured_path(500)
+    track.add([replace(one, lever=np.array([ahead_m, 0.0, 0.0])) for one in fixes])
+    track.judge(track.values, path, in_world=True)
+    assert (track.mounting is None) is is_right
+    assert any(one.state is State.ACCEPTED for one in track.verdicts()) is is_right

@@ -24,7 +24,7 @@ from umf_ros.core.odometry_noise import OdometryNoise
 
 STRETCH_M = 10.0
 """Path length over which measurements are averaged (*by hand*: multipath jumps further than odometry drifts in it)."""
-GATE = float(chdtri(3, 1 - 0.999))
+GATE, _FLAT_GATE = (float(chdtri(axes, 1 - 0.999)) for axes in (3, 2))
 """Largest squared Mahalanobis distance of a right measurement."""
 SUPPORT = 4
 """Least number of consecutive stretches that agree (*by hand*: longer than the path through one reflection)."""
@@ -347,7 +347,7 @@ class Track:
         offset, covariance = offset[:2], covariance[:2, :2]  # turns about the vertical do not show the third
         if np.sqrt(np.linalg.eigvalsh(covariance).max()) > well_known:
             return unknown
-        if np.linalg.norm(offset) > large and float(offset @ np.linalg.solve(covariance, offset)) > GATE:
+        if np.linalg.norm(offset) > large and float(offset @ np.linalg.solve(covariance, offset)) > _FLAT_GATE:
             self.mounting = offset
             return _MOUNTED_WRONG
         return _AGREES
