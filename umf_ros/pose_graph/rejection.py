@@ -370,15 +370,16 @@ class OutlierRejection:
         return np.array([decision in (verdict.state, verdict.reason) for verdict in self.verdicts], bool)
 
     def _accept(self, reasons: dict[int, ClosureReason]) -> bool:
-        """Accept closures and solve the map with them; return false without any."""
+        """Accept closures, and solve the map unless they agree with it; return false without any."""
+        if not reasons:
+            return False
         for row, reason in reasons.items():
             self.verdicts[row] = replace(self.verdicts[row], state=State.ACCEPTED, reason=reason)
         if all(reason is ClosureReason.AGREES and self._joined[row] for row, reason in reasons.items()):
-            self._is_outdated |= bool(reasons)
-            self._is_rough |= bool(reasons)
+            self._is_rough = self._is_outdated = True
         else:
             self.solve(rough=True)
-        return bool(reasons)
+        return True
 
     def solve(self, rough: bool = False) -> None:
         """Solve the map with the accepted closures, or solve it roughly, which takes half the time.
