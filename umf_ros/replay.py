@@ -42,9 +42,9 @@ class Replay:
         settings: all settings.
         detector: made with these settings, or with the database of the run that is resumed.
         resume: continue an earlier replay of the same recording into this folder.
+        sensor_check: takes every frame, if given.
 
     Attributes:
-        sensor_check: check of the sensors, fed with every frame.
         faults: frames that were skipped after internal errors; `faults.log` in the folder has the tracebacks.
         counts: of a localising run, as in its summary: `keyframes`, those up to the first known pose (None while there
             is none), those with a known pose, how often a pose was found or another one than before, and closures that
@@ -54,14 +54,21 @@ class Replay:
         UmfError: the map has not been solved, or is damaged.
     """
 
-    def __init__(self, folder: Path, settings: Settings, detector: LoopDetector, resume: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        settings: Settings,
+        detector: LoopDetector,
+        resume: bool = False,
+        sensor_check: SensorCheck | None = None,
+    ) -> None:
         self._folder = folder
         self._detector = detector
         self._localizer = open_localizer(settings) if settings.localizing else None
         self._graph = self._localizer or PoseGraph(settings.pose_graph)
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometrySessionSplitter(self._graph)
-        self.sensor_check = SensorCheck()
+        self._sensor_check = sensor_check
         self._checking = ThreadPoolExecutor(1, "sensor-check")  # OpenCV releases the interpreter lock
         self._unchecked: deque[Future[None]] = deque()
         self.faults = 0
@@ -93,7 +100,8 @@ class Replay:
                 self._graph.add_absolute(item)
                 self._graph.update()
                 continue
-            self._check_sensors(item)
+            if self._sensor_check is not None:
+                self._check_sensors(self._sensor_check, item)
             if self._done > WARM_UP:
                 yield self._skip_known(item)
                 continue
@@ -110,8 +118,8 @@ class Replay:
             if detection.fault is not None:
                 raise detection.fault
 
-    def _check_sensors(self, frame: Frame) -> None:
-        self._unchecked.append(self._checking.submit(self.sensor_check.take, frame))
+    def _check_sensors(self, check: SensorCheck, frame: Frame) -> None:
+        self._unchecked.append(self._checking.submit(check.take, frame))
         while len(self._unchecked) > FRAMES_AHEAD or (self._unchecked and self._unchecked[0].done()):
             self._unchecked.popleft().result()
 

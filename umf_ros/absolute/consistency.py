@@ -59,12 +59,12 @@ _MOUNTED_WRONG = State.REJECTED, AbsoluteReason.MOUNTING
 def position_drift(noise: OdometryNoise, path_m: Array) -> Array:
     """Return the variance per axis (m^2) of the odometry's translation over path lengths, from a known attitude."""
     random = noise.sigma_m**2 * path_m + noise.sigma_rad**2 * path_m**3 / 3
-    return noise.scale**2 * random + (_ATTITUDE**2 + _SYSTEMATIC**2) * path_m**2
+    return random + (_ATTITUDE**2 + _SYSTEMATIC**2) * path_m**2
 
 
 def attitude_drift(noise: OdometryNoise, path_m: Array) -> Array:
     """Return the variance per axis (rad^2) of the odometry's attitude over path lengths."""
-    return (noise.scale * noise.sigma_rad) ** 2 * path_m + (_SYSTEMATIC_RAD * path_m) ** 2
+    return noise.sigma_rad**2 * path_m + (_SYSTEMATIC_RAD * path_m) ** 2
 
 
 def longest_chain(values: Array, variances: Array, path_m: Array, drift: Array) -> NDArray[np.bool_]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -122,23 +121,6 @@ def write_verdicts(path: Path, verdicts: Iterable[AbsoluteVerdict]) -> None:
         for one in verdicts
     )
     write_table(path, VERDICT_COLUMNS, rows)
-
-
-def read_verdict_states(path: Path) -> list[tuple[int, State]]:
-    """Return stamp and state of the measurements in the table of a run; empty without a table."""
-    return [(int(row["stamp_ns"]), State(row["verdict"])) for row in _read_rows(path)]
-
-
-def read_verdict_counts(path: Path) -> Counter[tuple[str, str, str]]:
-    """Return the number of measurements by source, verdict and reason in the table of a run; empty without a table."""
-    return Counter((row["source"], row["verdict"], row["reason"]) for row in _read_rows(path))
-
-
-def _read_rows(path: Path) -> list[dict[str, str]]:
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def decode_fix(message: Any, stamp_ns: int, lever: Array) -> AbsoluteMeasurement:

@@ -1,4 +1,4 @@
-"""Error model of odometry: a random walk along the path, with a scale that is estimated."""
+"""Error model of odometry: a random walk along the path."""
 
 from __future__ import annotations
 
@@ -11,30 +11,21 @@ from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array
 
 
+# by hand: path length that a turn by a radian and a second count as, m
+_M_PER_RAD, _M_PER_S = 0.5, 1e-4
+
+
 @dataclass(frozen=True)
 class OdometryNoise:
-    """Standard deviations of odometry, by path length.
-
-    Random errors grow with the root of the path length, systematic errors in proportion to it. Turns and time count
-    as path length.
+    """Standard deviations of odometry, which grow with the root of the path length.
 
     Attributes:
-        sigma_m: random position error after one metre, per axis, m.
-        sigma_rad: random orientation error after one metre, per axis, rad.
-        drift_m: systematic position error per metre, m.
-        drift_rad: systematic orientation error per metre, rad.
-        m_per_rad: path length that a turn counts as, metres per radian.
-        m_per_s: path length that a second counts as, m.
-        scale: estimated factor on all standard deviations.
+        sigma_m: position error after one metre, per axis, m.
+        sigma_rad: orientation error after one metre, per axis, rad.
     """
 
-    sigma_m: float = 0.0
-    sigma_rad: float = 0.0
-    drift_m: float = 0.0
-    drift_rad: float = 0.0
-    m_per_rad: float = 0.5
-    m_per_s: float = 1e-4
-    scale: float = 1.0
+    sigma_m: float
+    sigma_rad: float
 
     @staticmethod
     def stated(settings: PoseGraphSettings) -> OdometryNoise:
@@ -45,17 +36,9 @@ class OdometryNoise:
         """Return (N,) path lengths in metres of the steps from (N, 4, 4) poses `a` to `b` in (N,) seconds."""
         turns = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], -1, -2) @ b[:, :3, :3]).magnitude()
         moved = np.linalg.norm(b[:, :3, 3] - a[:, :3, 3], axis=1)
-        return np.asarray(moved + self.m_per_rad * turns + self.m_per_s * elapsed_s)
-
-    def deviations(self, path_m: Array | float) -> tuple[Array, Array]:
-        """Return standard deviations of position, m, and orientation, rad, per axis, after path lengths."""
-        path = np.asarray(path_m, float)
-        position = np.hypot(self.sigma_m * np.sqrt(path), self.drift_m * path)
-        orientation = np.hypot(self.sigma_rad * np.sqrt(path), self.drift_rad * path)
-        return self.scale * position, self.scale * orientation
+        return np.asarray(moved + _M_PER_RAD * turns + _M_PER_S * elapsed_s)
 
     def covariances(self, path_m: Array) -> Array:
         """Return (N, 6, 6) covariances of steps of (N,) path lengths, GTSAM's order (rx ry rz x y z), rad^2 and m^2."""
-        position, orientation = self.deviations(path_m)
-        diagonals = np.stack([orientation] * 3 + [position] * 3, axis=-1) ** 2
-        return diagonals[..., None] * np.eye(6)
+        deviations = np.array([self.sigma_rad] * 3 + [self.sigma_m] * 3) * np.sqrt(path_m)[..., None]
+        return (deviations**2)[..., None] * np.eye(6)

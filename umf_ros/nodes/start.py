@@ -10,6 +10,7 @@ import re
 import signal
 import sys
 from collections.abc import Iterator, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -35,20 +36,10 @@ def start(module: str) -> None:
     main()
 
 
-def loop_closure_node() -> None:
-    """Run `ros2 run umf_ros loop_closure_node`."""
-    start("umf_ros.nodes.loop_closure_node")
-
-
-def pose_graph_node() -> None:
-    """Run `ros2 run umf_ros pose_graph_node`."""
-    start("umf_ros.nodes.pose_graph_node")
-
-
-def map_node() -> None:
-    """Run `ros2 run umf_ros map_node`."""
-    start("umf_ros.nodes.map_node")
-
+loop_closure_node, pose_graph_node, map_node = (
+    partial(start, f"umf_ros.nodes.{node}") for node in ("loop_closure_node", "pose_graph_node", "map_node")
+)
+"""Entry points of the executables."""
 
 PARAMETERS = "ros__parameters"
 

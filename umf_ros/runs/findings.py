@@ -10,13 +10,13 @@ from typing import Literal
 
 import numpy as np
 
-from umf_ros.absolute.measurement import read_verdict_counts
 from umf_ros.bags.inputs import SEVERITIES, Advice, Severity, absent_inputs, useless_inputs
 from umf_ros.bags.sensor_check import Overlay, SensorReport
 from umf_ros.core.config import Settings
 from umf_ros.core.geometry import Array
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, explain
+from umf_ros.runs.run_file import read_absolute_verdicts
 from umf_ros.runs.truth import JudgedRun, in_words
 
 REFUSED = ("size", "encoding", "step", "truncated", "compressed", "fields", "datatype", "unusable", "stamp")
@@ -140,13 +140,13 @@ def _graph(about: JudgedRun) -> Iterator[Advice]:
 
 
 def _absolute(about: JudgedRun) -> Iterator[Advice]:
-    counts = read_verdict_counts(about.run.folder / "absolute_verdicts.csv")
-    for source in sorted({source for source, _, _ in counts}):
-        own = Counter({(state, reason): number for (name, state, reason), number in counts.items() if name == source})
-        accepted = sum(number for (state, _), number in own.items() if state == State.ACCEPTED)
-        left = Counter({reason: number for (state, reason), number in own.items() if state != State.ACCEPTED})
+    verdicts = read_absolute_verdicts(about.run.folder / "absolute_verdicts.csv")
+    for source in sorted({one.source for one in verdicts}):
+        own = [one for one in verdicts if one.source is source]
+        left = Counter(one.reason for one in own if one.state is not State.ACCEPTED)
         why = f" ({left.most_common(1)[0][0]})" if left else ""
-        what = f"{source}: {accepted} of {own.total()} measurements accepted{why}"
+        accepted = len(own) - left.total()
+        what = f"{source}: {accepted} of {len(own)} measurements accepted{why}"
         if accepted:
             yield Advice("note", what)
         else:

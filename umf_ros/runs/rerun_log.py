@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from umf_ros.absolute.measurement import read_verdict_states
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.config import TerrainSettings
 from umf_ros.core.errors import ConfigError, writing
 from umf_ros.core.frames import Frame, Keyframe, State
 from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.runs.run_file import read_closures, read_verdicts
+from umf_ros.runs.run_file import read_absolute_verdicts, read_closures, read_verdicts
 from umf_ros.terrain.grid import FREE, NEAR_LIMIT, OBSTACLE, UNKNOWN, make_grid
 from umf_ros.terrain.voxels import VoxelMap
 
@@ -118,13 +117,13 @@ class RerunLog:
         closures = folder / "closures.csv"
         verdicts = read_verdicts(folder / "graph_verdicts.csv", read_closures(closures) if closures.is_file() else ())
         ends = {key: one.state for key, one in verdicts.items()}
-        measured = read_verdict_states(folder / "absolute_verdicts.csv")
+        measured = read_absolute_verdicts(folder / "absolute_verdicts.csv")
         for state, colour in STATE_COLOURS.items():
             stamps = np.array([key for key, own in ends.items() if own is state], np.int64).reshape(-1, 2)
             places, known = driven.at(stamps.ravel())
             lines = places[:, :3, 3].reshape(-1, 2, 3)[known.reshape(-1, 2).all(axis=1)]
             self._log.log(f"map/closures/{state.value}", rerun.LineStrips3D(lines, colors=[colour]), static=True)
-            places, known = driven.at(np.array([stamp for stamp, own in measured if own is state], np.int64))
+            places, known = driven.at(np.array([one.stamp_ns for one in measured if one.state is state], np.int64))
             shown = rerun.Points3D(places[known, :3, 3], radii=0.1, colors=[colour])
             self._log.log(f"map/absolute/{state.value}", shown, static=True)
 

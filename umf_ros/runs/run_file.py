@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.absolute.measurement import AbsoluteMeasurement
+from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteReason, AbsoluteVerdict, Aid
 from umf_ros.core.errors import UmfError, writing
 from umf_ros.core.frames import Candidate, LoopClosure, Points
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
@@ -321,6 +321,17 @@ def read_verdicts(path: Path, closures: Iterable[LoopClosure]) -> dict[Endpoints
 
     found = read_table(path, parse) if path.is_file() else []
     return {one.closure.endpoints: one for one in found if one is not None}
+
+
+def read_absolute_verdicts(path: Path) -> list[AbsoluteVerdict]:
+    """Return the verdicts on absolute measurements of a run; empty without a table."""
+
+    def parse(row: dict[str, str]) -> AbsoluteVerdict:
+        decision = State(row["verdict"]), AbsoluteReason(row["reason"])
+        figures = float(row["mahalanobis"]), float(row["misfit"])
+        return AbsoluteVerdict(Aid(row["source"]), int(row["stamp_ns"]), *decision, *figures)
+
+    return read_table(path, parse) if path.is_file() else []
 
 
 def read_keyframes(path: Path) -> NDArray[np.void]:

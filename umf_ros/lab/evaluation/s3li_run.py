@@ -233,14 +233,15 @@ def write_calibration(one: S3liSequence, folder: Path, notes: list[str]) -> Path
 def _replayed(
     folder: Path, recording: Any, settings: Settings, odometry: Trajectory | None, notes: list[str]
 ) -> tuple[FinishedRun, SensorCheck]:
-    replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
+    check = SensorCheck()
+    replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)), sensor_check=check)
     reader = FrameReader(recording, settings, odometry, warn=notes.append)
     for _ in replay.run(reader.stream()):
         _progress(reader.progress)
     replay.finish(count_drops(reader.counters))
     replay.raise_if_frames_failed()
     remember_recording(folder, recording)
-    return read_run(folder), replay.sensor_check
+    return read_run(folder), check
 
 
 def judged_record(about: JudgedRun, odometry: Trajectory | None) -> Record:

@@ -16,7 +16,7 @@ from rich.console import Console
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.sensor_check import SensorReport
+from umf_ros.bags.sensor_check import SensorCheck, SensorReport
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.errors import UmfError
 from umf_ros.core.tasks import spread
@@ -124,16 +124,17 @@ def replay(task: SensorTask) -> None:
     recording = open_bag(task.bag)
     settings = settings_for(recording, task.config, "auto", **SENSORS[task.name])
     task.folder.mkdir(parents=True)
-    run = Replay(task.folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
+    check = SensorCheck() if task.report else None
+    run = Replay(task.folder, settings, LoopDetector(settings, make_detector_embedder(settings)), sensor_check=check)
     reader = FrameReader(recording, settings, None, warn=lambda text: None)
     for _ in run.run(reader.stream()):
         pass
     run.finish(count_drops(reader.counters))
     run.raise_if_frames_failed()
     remember_recording(task.folder, recording)
-    if task.report:
+    if check is not None:
         finished = read_run(task.folder, recording, reader.ground_truth)
-        sensors = run.sensor_check.report(read_odometry_of(task.folder))
+        sensors = check.report(read_odometry_of(task.folder))
         finish_run(finished, recording, Console(file=StringIO()), sensors)
 
 
