@@ -20,6 +20,7 @@ from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, AbsoluteWorld, open_ground
 from umf_ros.pose_graph import backend
 from umf_ros.pose_graph.backend import PoseGraph
+from umf_ros.runs.run_file import read_absolute_verdicts
 
 WORLD = open_ground(10_000, 500.0)
 ORIGIN = " ".join(map(str, WORLD.origin))

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array
 
-
 # by hand: path length that a turn by a radian and a second count as, m
 _M_PER_RAD, _M_PER_S = 0.5, 1e-4
 

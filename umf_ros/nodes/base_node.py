@@ -336,27 +336,24 @@ class BaseNode(LifecycleNode, ABC):
                 self._report_fault(error, name)
             return False, str(error)
 
-    def _offer(self, kind: type, name: str, action: Callable[[Any], str]) -> None:
-        """Offer a service that answers with the text of `action`."""
-
-        def answer(request: Any, response: Any) -> Any:
-            response.success, response.message = self._answer(name, action, request)
-            return response
-
-        self.create_service(kind, name, answer)
-
-    def _offer_in_turn(
-        self, worker: Worker[Callable[[], None]], name: str, action: Callable[[Any], str], kind: type = Trigger
+    def _offer(
+        self, worker: Worker[Callable[[], None]] | None, name: str, action: Callable[[Any], str], kind: type = Trigger
     ) -> None:
-        """Offer a service whose action a worker does when it is its turn: the executor goes on meanwhile."""
+        """Offer a service that answers with the text of `action`, which runs at once without a worker.
 
-        def act(request: Any, answered: Future) -> None:
-            with watchdog.task(name, watchdog.PATIENT_S):
-                answered.set_result(self._answer(name, action, request))
+        A worker runs it when it is its turn: the executor goes on meanwhile.
+        """
 
         async def answer(request: Any, response: Any) -> Any:
             answered = Future()
-            if not worker.submit(lambda: act(request, answered), needed=True):
+
+            def act() -> None:
+                with watchdog.task(name, watchdog.PATIENT_S):
+                    answered.set_result(self._answer(name, action, request))
+
+            if worker is None:
+                act()
+            elif not worker.submit(act, needed=True):
                 answered.set_result((False, "the node ends, or has too much to do"))
             response.success, response.message = await answered
             return response

@@ -20,7 +20,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 from visualization_msgs.msg import MarkerArray
 
 from umf_ros.core import watchdog
@@ -93,9 +93,9 @@ class LoopClosureNode(BaseNode):
                 qos = messages.sensor_qos(settings.qos)
                 self._subscribe(name, MESSAGE_TYPES[name], self._own_topic(name, topics), take, qos)
         self._saver: Worker[Callable[[], None]] = Worker(lambda step: step(), self._report_fault, 1)
-        self._offer_in_turn(self._saver, "~/save", lambda _: self._grow() if settings.grows_map else self._save())
-        self._offer(Trigger, "~/reset", self._reset)
-        self._offer(SetBool, "~/pause", self._pause)
+        self._offer(self._saver, "~/save", lambda _: self._grow() if settings.grows_map else self._save())
+        self._offer(None, "~/reset", self._reset)
+        self._offer(None, "~/pause", self._pause, SetBool)
 
     def _finish(self) -> None:
         """Finish every frame in hand and write the results."""

@@ -45,7 +45,7 @@ class MapNode(BaseNode):
         self._map = LivingMap(self._settings.terrain)
         self._path: PathMessage | None = None
         self._version, self._sent = 0, {"cloud": 0, "grid": 0}
-        self._due_s, self._bytes, self._queued = 0.0, 0, False
+        self._due_s, self._bytes = 0.0, 0
         self._publishers_of: dict[str, Any] = {
             "cloud": self.create_publisher(PointCloud2, "~/map_cloud", LATCHED_QOS),
             "grid": self.create_publisher(OccupancyGrid, "~/map_grid", LATCHED_QOS),
@@ -55,7 +55,7 @@ class MapNode(BaseNode):
         scans = "loop_closure_node/keyframe_scans"
         self._subscribe("scans", PointCloud2, scans, self._on_scan, QoSProfile(depth=SCAN_DEPTH), rare=True)
         self._subscribe("path", PathMessage, "pose_graph_node/path", self._on_path, LATCHED_QOS, rare=True)
-        self._offer_in_turn(self._worker, "~/save", lambda _: self._save())
+        self._offer(self._worker, "~/save", lambda _: self._save())
 
     def _finish(self) -> None:
         self._worker.close(timeout_s=watchdog.PATIENT_S)
@@ -87,10 +87,8 @@ class MapNode(BaseNode):
     def _tick(self) -> None:
         wanted = self._map.added > MOST_ADDED
         wanted = wanted or any(publisher.get_subscription_count() for publisher in self._publishers_of.values())
-        if wanted and not self._queued and time.monotonic() >= self._due_s:
-            self._queued = True  # before the worker can reset it
-            if not self._worker.submit(self._show, needed=True):
-                self._queued = False
+        if wanted and time.monotonic() >= self._due_s:
+            self._worker.submit(self._show, needed=True, once=True)
         self._diagnose(self._judge(self._own_status()))
 
     def _update(self) -> None:
@@ -103,7 +101,6 @@ class MapNode(BaseNode):
     def _show(self) -> None:
         """Publish what has changed and has subscribers, then pause as the limits of rate and bytes say."""
         began_s, sent = time.thread_time(), 0
-        self._queued = False
         self._update()
         readers = {name: one.get_subscription_count() for name, one in self._publishers_of.items()}
         wanted = [name for name, count in readers.items() if count and self._sent[name] != self._version]

@@ -72,7 +72,6 @@ class PoseGraphNode(BaseNode):
         # newest odometry in path and markers; None: verdicts have changed since
         self._drawn_ns: int | None = None
         self._next_draw_s = 0.0
-        self._update_queued = False
         # each counted by one thread
         self._closures_taken = self._closures_decided = 0
         self._make_publishers()
@@ -91,16 +90,12 @@ class PoseGraphNode(BaseNode):
         self.create_subscription(String, "~/reject_edge", self._guarded("reject_edge", self._on_reject), 10)
         hear = self._guarded("front-end", self._on_front_end)
         self.create_subscription(TransitionEvent, f"{FRONT_END}/transition_event", hear, 10)
-        self._offer_in_turn(self._worker, "~/reject_last", lambda _: self._reject_last())
-        self._offer_in_turn(self._worker, "~/save", lambda _: self._save())
-        self._offer_in_turn(self._worker, "~/reset", lambda _: self._reset())
-        self._offer_in_turn(self._worker, "~/add_closure", self._add_by_hand, AddDiagnostics)
-        self._offer_in_turn(
-            self._worker, "~/reject_edge", partial(self._decide_by_hand, state=State.REJECTED), AddDiagnostics
-        )
-        self._offer_in_turn(
-            self._worker, "~/undo_edit", partial(self._decide_by_hand, state=State.PENDING), AddDiagnostics
-        )
+        self._offer(self._worker, "~/reject_last", lambda _: self._reject_last())
+        self._offer(self._worker, "~/save", lambda _: self._save())
+        self._offer(self._worker, "~/reset", lambda _: self._reset())
+        self._offer(self._worker, "~/add_closure", self._add_by_hand, AddDiagnostics)
+        self._offer(self._worker, "~/reject_edge", partial(self._decide_by_hand, state=State.REJECTED), AddDiagnostics)
+        self._offer(self._worker, "~/undo_edit", partial(self._decide_by_hand, state=State.PENDING), AddDiagnostics)
 
     def _finish(self) -> None:
         """Process the queue, settle the graph and write the results."""
@@ -230,25 +225,18 @@ class PoseGraphNode(BaseNode):
         newest_ns = self._state.newest_ns
         if listeners and self._drawn_ns != newest_ns and time.monotonic() >= self._next_draw_s:
             started_s, self._drawn_ns = time.thread_time(), newest_ns
-            self._draw()
+            stamps, poses, closures, absolute = self._durable.drawing()
+            self._path_publisher.publish(messages.path(stamps, poses, self._frames))
+            header = messages.to_header(max(newest_ns, 0), self._frames.map)
+            self._marker_publisher.publish(messages.to_markers(closures, header, absolute))
             self._next_draw_s = time.monotonic() + DRAWING * (time.thread_time() - started_s)
 
-    def _draw(self) -> None:
-        stamps, poses, closures, absolute = self._durable.drawing()
-        self._path_publisher.publish(messages.path(stamps, poses, self._frames))
-        header = messages.to_header(max(self._state.newest_ns, 0), self._frames.map)
-        self._marker_publisher.publish(messages.to_markers(closures, header, absolute))
-
     def _tick(self) -> None:
-        if not self._update_queued:  # queued at most once, however long the worker is busy
-            self._update_queued = True  # before the worker can reset it
-            if not self._worker.submit(self._update, needed=True):
-                self._update_queued = False
+        self._worker.submit(self._update, needed=True, once=True)
         self._diagnose(self._judge(self._own_status()))
 
     def _update(self) -> None:
         """Decide about closures whose odometry has arrived, and publish the new path."""
-        self._update_queued = False
         self._announce(self._durable.update(exactly=not self._closures_waiting))
         if not self._closures_waiting:
             self._durable.prepare(PREPARE_S)

@@ -41,11 +41,16 @@ class Worker(Generic[Item]):
         self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
         self._thread.start()
 
-    def submit(self, item: Item, needed: bool = False) -> bool:
-        """Queue an item, without waiting; return false where it is not taken. A needed one that is taken is done."""
+    def submit(self, item: Item, needed: bool = False, once: bool = False) -> bool:
+        """Queue an item, without waiting; return false where it is not taken. A needed one that is taken is done.
+
+        With `once` it is not queued a second time while it waits.
+        """
         with self._wake:
             if self._closing:
                 return False
+            if once and any(waiting == item for waiting, _ in self._queue):
+                return True
             if len(self._queue) == self._queue_size:
                 self.dropped += 1
                 oldest = next((place for place, (_, kept) in enumerate(self._queue) if not kept), None)
