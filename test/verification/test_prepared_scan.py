@@ -69,6 +69,6 @@ def test_the_rays_of_merged_scans_start_where_each_was_taken() -> None:
     merged = PreparedScan(wall.astype(np.float32), np.stack([behind, here]), owner=owner)
     alone = PreparedScan(wall.astype(np.float32), here)
     free = np.array([[-2.0, 0.1, 0.1]])  # between the two places
-    assert merged.look_at(free) == Sight.PASSED and alone.look_at(free) == Sight.UNSEEN
+    assert merged.look_at(free) == Sight.PASSED and alone.look_at(free) == Sight.HIDDEN
     assert merged.look_at(wall[:1]) == Sight.MET
     assert merged.look_at(np.array([[12.0, 0.1, 0.1]])) == Sight.HIDDEN

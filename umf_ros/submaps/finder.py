@@ -67,7 +67,7 @@ class SubmapFinder:
             query: the newest keyframe, not yet remembered.
             verdicts: about its scan.
         """
-        asked = self.history.needed or self.history.keypoints
+        asked = self.history.needed or self.history.keypoints.rows
         if self._note_closures(query, verdicts) or not asked or not can_be_merged(query):
             return list(verdicts)
         expected = self._expected(query)

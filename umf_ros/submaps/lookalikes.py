@@ -31,9 +31,6 @@ class KeypointIndex:
         for row, keypoints in submaps.items():
             self.add(row, keypoints)
 
-    def __len__(self) -> int:
-        return len(self.rows)
-
     def add(self, row: int, keypoints: Keypoints) -> None:
         """Add the keypoints (K, 130) of a submap."""
         self._index.add(keypoints[:, 2:])
@@ -64,7 +61,8 @@ class KeypointIndex:
     def _votes(self, query: Keypoints, admissible: NDArray[np.bool_]) -> NDArray[np.float32]:
         """(S,) for every submap: by how much its keypoints are more like the query's than most others'."""
         known = np.repeat(admissible, np.diff(self._firsts))
-        kept, votes = min(const.KEYPOINT_VOTES, int(known.sum()) - 1), np.zeros((len(query), len(self)), np.float32)
+        kept = min(const.KEYPOINT_VOTES, int(known.sum()) - 1)
+        votes = np.zeros((len(query), len(self.rows)), np.float32)
         if len(query) >= const.MIN_KEYPOINTS and kept > 0:
             value, found = self._index.nearest(np.ascontiguousarray(query[:, 2:]), kept + 1, known)
             owner = np.searchsorted(self._firsts, found, side="right") - 1

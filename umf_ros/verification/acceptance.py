@@ -165,10 +165,6 @@ class AcceptanceModel:
         odds = self.models[kind_of(measurements)].odds(scores(measurements))
         return 1.0 / (1.0 + math.exp(-min(max(odds, -60.0), 60.0)))
 
-    def at_best(self, measurements: Measurements) -> float:
-        """The same if no other pose fitted the scans: what it cannot exceed before the ambiguity is known."""
-        return self.probability(measurements | WITHOUT_RIVALS)
-
     def out_of_range(self, measurements: Measurements) -> str:
         """Name and value of a number that no right example of the fit had; empty without one."""
         for name, (least, greatest) in self.bounds.get(kind_of(measurements), {}).items():

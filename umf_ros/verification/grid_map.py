@@ -75,7 +75,7 @@ class GridMap:
 
     @property
     def even(self) -> bool:
-        """Whether it shows bare, even ground alone."""
+        """Whether it shows bare, even ground alone, which could lie anywhere on such ground."""
         known = self.known_relief[np.isfinite(self.known_relief)]
         return len(known) > 0 and float(known.std()) < const.BARE_RELIEF_CELLS * self.cell_m
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -29,34 +28,26 @@ from umf_ros.verification.keypoints import common_keypoints
 from umf_ros.verification.prepared_scan import PreparedScan, levelled, structured, submaps, views_decide
 from umf_ros.verification.scan_alignment import run_gicp
 from umf_ros.verification.view_alignment import PairedViews
-from umf_ros.verification.visibility import visible
+from umf_ros.verification.visibility import Sight
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
+class Fit(NamedTuple):
     """One way two scans could lie on each other.
 
     Attributes:
         pose: (4, 4) `match_T_query`.
         share: of some points that the other scan should see, how many have a counterpart; the mean of both ways.
         terrain: how well the relief fits there, in standard deviations of chance.
-        structured: whether enough stands around both to be compared, where terrain says nothing.
     """
 
     pose: Array
     share: float
     terrain: float
-    structured: bool
 
     @property
     def score(self) -> float:
         """Rank of the fit: counterparts, and terrain where they say little."""
         return self.share + const.TERRAIN_WEIGHT * self.terrain
-
-    @property
-    def telling(self) -> bool:
-        """Whether there is anything that could have spoken against it; two bare planes fit anywhere."""
-        return self.structured or self.terrain >= const.MIN_MAP_SCORE
 
 
 class RotatedMaps:
@@ -90,13 +81,15 @@ def search(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
         correlation /= np.sqrt(variance + const.LEAST_CHANCE * variance.max(axis=(1, 2, 3), keepdims=True))
     best = _peaks(correlation, wanted, peaks, ours.cell_m)
     guesses = [lifted(match, turned.scan, float(const.ALL_HEADINGS[index]), shift) for index, shift in best]
-    fits = coarse_align(match, turned.scan, guesses)
-    return sorted((fit for fit in fits if fit.telling), key=lambda fit: -fit.score)
+    return sorted(coarse_align(match, turned.scan, guesses), key=lambda fit: -fit.score)
 
 
 def coarse_align(match: PreparedScan, query: PreparedScan, guesses: Sequence[Array]) -> list[Fit]:
-    """Refine poses by a few points, and count how many of them find a counterpart."""
-    poses = [_by_scouts(match, query, guess) for guess in guesses]
+    """Refine poses by a few points, and rank them by how many of these find a counterpart.
+
+    Poses that nothing could have spoken against are left out: two bare planes fit anywhere.
+    """
+    poses = [run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M) for guess in guesses]
     reach_m = const.SCOUT_NEAR * query.cell_m
     there = _found_shares(match, [transform(pose, query.scouts) for pose in poses], reach_m)
     back = _found_shares(query, [transform(invert(pose), match.scouts) for pose in poses], reach_m)
@@ -104,7 +97,8 @@ def coarse_align(match: PreparedScan, query: PreparedScan, guesses: Sequence[Arr
     fits = []
     for pose, share in zip(poses, (there + back) / 2, strict=True):
         terrain = terrain_fit(match.terrain, query.terrain, levelled(match, query, pose))[1]
-        fits.append(Fit(pose, float(share), terrain, known))
+        if known or terrain >= const.MIN_MAP_SCORE:
+            fits.append(Fit(pose, float(share), terrain))
     return fits
 
 
@@ -113,7 +107,7 @@ def _found_shares(scan: PreparedScan, sets: list[Array], reach_m: float) -> Arra
     if not sets:
         return np.empty(0)
     points = np.concatenate(sets)
-    seen = visible(scan.look_at(points)).reshape(len(sets), -1)
+    seen = (scan.look_at(points) != Sight.HIDDEN).reshape(len(sets), -1)
     close = (scan.nearest(points)[1] < reach_m**2).reshape(len(sets), -1)
     shares: Array = (seen & close).sum(axis=1) / np.maximum(seen.sum(axis=1), const.FEWEST_POINTS)
     return shares
@@ -133,12 +127,9 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     found = []
     for number in np.flatnonzero(match.view.overlap(query.view, turns) >= const.SEARCHED_OVERLAP):
         peaks = _peaks(correlation[:, [number]], np.zeros(1, np.intp), const.PEAKS // 2, query.cell_m)
-        found += [_by_scouts(match, query, lifted(match, query, turns[number], shift)) for _, shift in peaks]
+        guesses = [lifted(match, query, turns[number], shift) for _, shift in peaks]
+        found += [run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M) for guess in guesses]
     return [one for one in found if not near(one, pose, const.DISTINCT_M, np.pi / 2)]
-
-
-def _by_scouts(match: PreparedScan, query: PreparedScan, guess: Array) -> Array:
-    return run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M)
 
 
 def _correlate(around: Spectra, turned: Spectra, side: int) -> NDArray[np.float32]:
@@ -216,8 +207,7 @@ def find_hypotheses(
         count, turn, shift = common_keypoints(turned.scan.keypoints, match.keypoints)
         guess = lifted(match, turned.scan, turn, shift) if count else None
     if guess is not None:  # submaps that share little would not rank it first
-        expected = coarse_align(match, turned.scan, [guess])
-        fits = [replace(fit, share=1.0) for fit in expected if fit.telling] + fits
+        fits = [fit._replace(share=1.0) for fit in coarse_align(match, turned.scan, [guess])] + fits
     distinct: list[Fit] = []
     for fit in fits:
         if not any(same_pose(fit.pose, other.pose) for other in distinct):

@@ -150,11 +150,6 @@ class PreparedScan:
         """Whether there is anything to align."""
         return len(self.points) >= const.MIN_SCAN_POINTS
 
-    @property
-    def bare(self) -> bool:
-        """Whether it shows bare, even ground alone, which could lie anywhere on such ground."""
-        return self.terrain.even
-
     @cached_property
     def up(self) -> Array:
         """Rotation (3, 3) that sets the scan upright."""
@@ -330,7 +325,7 @@ def levelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
 
 def views_decide(match: PreparedScan, query: PreparedScan) -> bool:
     """Whether images have to tell the pose, where there are any: a scan is wanting, or both show bare ground alone."""
-    return not (match.usable and query.usable) or (match.bare and query.bare)
+    return not (match.usable and query.usable) or (match.terrain.even and query.terrain.even)
 
 
 def structured(match: PreparedScan, query: PreparedScan) -> bool:

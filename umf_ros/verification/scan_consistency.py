@@ -17,7 +17,7 @@ from umf_ros.verification.grid_map import relief_misfit
 from umf_ros.verification.pose_search import alternatives
 from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled, structured
 from umf_ros.verification.scan_alignment import SEARCHED
-from umf_ros.verification.visibility import Sight, visible
+from umf_ros.verification.visibility import Sight
 
 Mask = NDArray[np.bool_]
 
@@ -40,7 +40,7 @@ def compare_scans(match: PreparedScan, query: PreparedScan, pose: Array) -> dict
     stands = _upright(match, index), _upright(match, match.picks)
     ways = []
     for sight, distance, reach, upright in zip(sights, distances, reaches, stands, strict=True):
-        seen = visible(sight)
+        seen = sight != Sight.HIDDEN
         ways.append(
             {
                 "common": float(seen.mean()) if len(seen) else 0.0,
@@ -155,7 +155,7 @@ def beyond_walls(match: PreparedScan, query: PreparedScan, pose: Array) -> float
 
 
 def _beyond_walls(scan: PreparedScan, other: PreparedScan, other_T_scan: Array) -> float:
-    seen = _upright(scan, scan.picks) & visible(other.look_at(transform(other_T_scan, scan.sample)))
+    seen = _upright(scan, scan.picks) & (other.look_at(transform(other_T_scan, scan.sample)) != Sight.HIDDEN)
     points, normals = scan.sample[seen], scan.normals[scan.picks][seen]
     if len(points) < const.FEWEST_POINTS:
         return np.nan
@@ -192,7 +192,7 @@ def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array, standin
         scan.nearest(points)[1] if patterned(scan, other) else _nearest_of_others(scan, other, poses, points, rows)
     )
     misfit = np.minimum(away / reach, const.RIVAL_MISFIT)
-    seen = (visible(scan.look_at(points)) & np.isfinite(away)).reshape(len(poses), -1)
+    seen = ((scan.look_at(points) != Sight.HIDDEN) & np.isfinite(away)).reshape(len(poses), -1)
     otherwise = np.nan if standing else const.RIVAL_MISFIT
     return mean_misfits(misfit.reshape(seen.shape), seen, const.FEWEST_POINTS, otherwise)
 

@@ -13,7 +13,7 @@ from umf_ros.core.config import Verification
 from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading
 from umf_ros.verification import constants as const
-from umf_ros.verification.acceptance import load_acceptance, refuted
+from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
 from umf_ros.verification.passages import PassagePosition, locate_along
@@ -171,8 +171,9 @@ class Verifier:
         return judged
 
     def _promises(self, hypothesis: Hypothesis, least: float) -> bool:
-        """Whether a hypothesis of scans can be so probable."""
-        return bool(hypothesis.scans) and self._acceptance.at_best(hypothesis.measurements) >= least
+        """Whether a hypothesis of scans can be so probable: it is, if no other pose fits the scans."""
+        unrivalled = hypothesis.measurements | WITHOUT_RIVALS
+        return bool(hypothesis.scans) and self._acceptance.probability(unrivalled) >= least
 
     def _measure(self, hypothesis: Hypothesis) -> None:
         """Measure the pose; nothing stays of a pose that was measured before."""
@@ -206,7 +207,7 @@ class Verifier:
         """That a hypothesis is right; where scans show bare ground alone, nothing would refute a texture seen twice."""
         found = self._acceptance.probability(hypothesis.measurements)
         scans = [self.scans[keyframe] for keyframe in hypothesis.keyframes]
-        if hypothesis.scans or not all(scan.usable and scan.bare for scan in scans):
+        if hypothesis.scans or not all(scan.usable and scan.terrain.even for scan in scans):
             return found
         if hypothesis.measurements["spread"] < const.BARE_SPREAD:
             return 0.0

@@ -51,9 +51,7 @@ class Sight(IntEnum):
     PASSED = 1
     """Rays passed it by: it stands in free space."""
     HIDDEN = 2
-    """It lies behind what the rays met."""
-    UNSEEN = 3
-    """There are no rays in its direction, or it is too near to be seen."""
+    """It lies behind what the rays met, no ray is in its direction, or it is too near to be seen."""
 
 
 class RangeImage:
@@ -76,14 +74,9 @@ class RangeImage:
         margin = const.SIGHT_MARGIN_M + const.SIGHT_MARGIN * reach
         sight = np.full(len(points), Sight.MET, np.int8)
         sight[reach < self._nearest[row, column] - margin] = Sight.PASSED
-        sight[reach > self._farthest[row, column] + margin] = Sight.HIDDEN
-        sight[~self._known[row, column] | (reach < const.SIGHT_FROM_M)] = Sight.UNSEEN
+        unseen = ~self._known[row, column] | (reach < const.SIGHT_FROM_M)
+        sight[unseen | (reach > self._farthest[row, column] + margin)] = Sight.HIDDEN
         return sight
-
-
-def visible(sight: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """(N,) whether the rays should have met or did meet the points."""
-    return (sight == Sight.MET) | (sight == Sight.PASSED)
 
 
 def _filled(points: Array) -> Array:
