@@ -18,6 +18,9 @@ from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.odometry import POINT, CorrectedPath, OdometryChain, PathPoints, Rows, Stamps, noise_between
 from umf_ros.pose_graph.solver import Graph, GraphSolver
 
+# longest path between two solved poses, m. measured on a kilometre whose heading is off by 140 degrees at its end: between
+# closures alone the path is up to .9 m wrong and 5 of 22 right closures are rejected; with 400 m it is .5 mm, with 200 .1
+_SPACING_M = 200.0
 # lever arm in m that converts angular errors to displacements when paths through the graph are compared
 _LEVER_M = 10.0
 # pairs whose shortest paths are searched together: their trees take some tens of megabytes
@@ -145,7 +148,7 @@ class Sessions:
             np.unique(
                 np.concatenate(
                     [
-                        chain.stamps[: None if every_keyframe else 1],
+                        chain.stamps if every_keyframe else _spaced(chain),
                         *(end["stamp"][end["session"] == session] for end in ends),
                         self.reference.stamps(session, held[held["session"] == session]["travel"]),
                     ]
@@ -210,6 +213,11 @@ class Sessions:
                     moves[session] = moves[kept] if known else move @ moves[session]
                     components[session] = kept
         return components, moves
+
+
+def _spaced(chain: OdometryChain) -> Stamps:
+    """Return stamps of keyframes, the first of every `_SPACING_M` of a session's path."""
+    return chain.stamps[np.unique(chain.travel // _SPACING_M, return_index=True)[1]]
 
 
 def _paths_through(points: PathPoints, poses: Array) -> dict[int, CorrectedPath]:
