@@ -18,7 +18,7 @@ from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.odometry import POINT, CorrectedPath, OdometryChain, PathPoints, Rows, Stamps, noise_between
 from umf_ros.pose_graph.solver import Graph, GraphSolver
 
-# longest path between two solved poses, m. measured on a kilometre whose heading is off by 140 degrees: between closures
+# longest path between two solved poses, m. measured on a kilometre whose heading is off by 140 deg: between closures
 # alone, the path is up to .9 m wrong and 5 of 22 right closures are rejected; with 400 m it is .5 mm, with 200 m .1 mm
 _SPACING_M = 200.0
 # lever arm in m that converts angular errors to displacements when paths through the graph are compared
