@@ -208,19 +208,36 @@ def test_between_it_is_close_to_the_optimum_of_the_full_graph(turn_deg: float, m
     assert rms(found, full_optimum([0, 80], poses, 80)) < 0.05 * correction
 
 
-def test_a_kilometre_of_strong_drift_is_closed_by_all_closures_of_its_only_revisit() -> None:
-    """No single correction describes the path between: its rotation is off by radians."""
+def kilometre(seed: int) -> GraphWorld:
+    """Once round a circle of a kilometre with strong drift, and closures of its only revisit."""
     count, turn = 1012, np.array([0, 0, 2 * np.pi / 1000, 1.0, 0, 0])
-    errors = np.random.default_rng(6).normal(0, [*np.deg2rad([1, 1, 4]), 0.02, 0.02, 0.02], (count - 1, 6))
+    errors = np.random.default_rng(seed).normal(0, [*np.deg2rad([1, 1, 4]), 0.02, 0.02, 0.02], (count - 1, 6))
     odometry = [np.eye(4)]
     for step in expmap(turn[None]) @ expmap(errors):
         odometry.append(odometry[-1] @ step)
     covariances = np.tile(np.diag([np.deg2rad(5)] * 3 + [0.1] * 3) ** 2, (count, 1, 1))
     world = GraphWorld(expmap(np.arange(count)[:, None] * turn), np.stack(odometry), covariances, [])
-    pairs = [*((5, 995 + k) for k in range(5)), *((k, k + 1000) for k in range(5, 12))]
-    graph = drive(closing(world, pairs, noise=1.0))
+    return closing(world, [*((5, 995 + k) for k in range(5)), *((k, k + 1000) for k in range(5, 12))], noise=1.0)
+
+
+def test_strong_drift_is_closed_by_all_closures_of_the_only_revisit() -> None:
+    """No single correction describes the path between: its rotation is off by radians."""
+    world = kilometre(6)
+    graph = drive(world)
     graph.settle()
-    assert accepted(graph) == set(pairs)
+    assert accepted(graph) == {(c.first, c.second) for c in world.closures}
+
+
+@pytest.mark.parametrize(
+    ("probability", "state"), [(np.nan, State.PENDING), (0.7, State.PENDING), (0.97, State.ACCEPTED)]
+)
+def test_where_the_map_says_nothing_the_front_end_decides(probability: float, state: State) -> None:
+    world = kilometre(4)
+    graph = drive(world, closures=False)
+    for row in range(len(world.closures)):
+        graph.add_closure(replace(world.message(row), probability=probability))
+    graph.settle()
+    assert {verdict.state for verdict in graph.closures()} == {state}
 
 
 def test_the_end_of_a_mission_is_the_optimum_of_the_full_graph() -> None:

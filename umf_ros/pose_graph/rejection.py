@@ -43,15 +43,14 @@ _CLOSE_M = 2.0
 # largest odds against a closure without support: during the drive, and at the end; .1 during the drive accepts a group
 # of aliases in 2 of 42 cells of `pose_graph.py` with seed 25501, .03 none, and both accept all right closures
 _MOST_ODDS, _MOST_ODDS_AT_LAST = 0.03, 0.2
-# prior: one of five closures is wrong
-_WRONG_BEFORE, _RIGHT_BEFORE = 1, 4
+# prior: the front-end's probability, which counts as much as five closures; where it is unknown four of five are right
+_COUNTED, _USUALLY_RIGHT = 5, 0.8
 # wrong closures are seldom single: of those pending at the end of drives in worlds 10200-10473 of
 # `pose_graph.py` (benchmarks) 1 of 67 wrong ones was single and 59 of 213 right ones
 _WRONG_ALONE = 0.1
 # nothing contradicts a wrong closure between sessions that are not joined: at the end two places have to agree by 2.5
 # nats at least (*by hand*; `aliased_sessions.py`: without, one group of wrong closures joined 4 of 40 graphs)
 _WRONG_BETWEEN = 10.0
-_EVEN = 0.5
 _BY_HAND = {State.ACCEPTED: ClosureReason.ACCEPTED_BY_HAND, State.REJECTED: ClosureReason.BY_HAND}
 
 
@@ -342,9 +341,8 @@ class OutlierRejection:
         places = [[row, *self._consistency.companions(row, companions)] for row in np.flatnonzero(waiting).tolist()]
         self._gate(sorted({member for place in places for member in place}))
         # closures that are likelier wrong than right by the map do not count against others
-        against = self._of(State.ACCEPTED) | (np.array(self._ratios) < _EVEN)
-        best: list[int] = []
-        most_odds = _MOST_ODDS_AT_LAST if at_last else _MOST_ODDS
+        against = self._of(State.ACCEPTED) | (np.array(self._ratios) < 0.5)
+        best, most_odds = list[int](), _MOST_ODDS_AT_LAST if at_last else _MOST_ODDS
         for place in places:
             odds = self._odds_against(place, at_last)
             usual = [row for row, odd in zip(place, odds, strict=True) if waiting[row] and odd <= most_odds]
@@ -359,10 +357,12 @@ class OutlierRejection:
         if not at_last:
             return odds
         rejected, accepted = (int(self._of(state).sum()) for state in (State.REJECTED, State.ACCEPTED))
-        prior = (_WRONG_BEFORE + rejected) / (_RIGHT_BEFORE + accepted)
+        stated = [self.placed[row].closure.probability for row in place]
+        right = np.clip(np.nanmedian(stated), 0.01, 0.99) if np.isfinite(stated).any() else _USUALLY_RIGHT
+        prior = (_COUNTED * (1 - right) + rejected) / (_COUNTED * right + accepted)
         odds = odds * np.exp(-self._consistency.consistency_set(place[0], self._of(State.PENDING))[1])
         if not self._joined[place[0]]:
-            return odds * max(prior, _WRONG_BEFORE / _RIGHT_BEFORE) * _WRONG_BETWEEN
+            return odds * max(prior, 1 / _USUALLY_RIGHT - 1) * _WRONG_BETWEEN
         return odds * prior * (_WRONG_ALONE if len(place) == 1 else 1.0)
 
     def _of(self, decision: State | ClosureReason) -> NDArray[np.bool_]:

@@ -141,7 +141,7 @@ class Sessions:
         return self._graph(self._stamps(extra, every_keyframe=True), closures, self.components)[1]
 
     def _stamps(self, closures: Closures, every_keyframe: bool = False) -> list[Stamps]:
-        """Return stamps of the first or of every keyframe of each session, and of the endpoints of closures."""
+        """Return stamps of some or of all keyframes of each session, and of the endpoints of closures."""
         ends = [closures["match"], closures["query"]]
         held = np.concatenate(ends)
         return [
