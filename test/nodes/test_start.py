@@ -18,7 +18,9 @@ COMMANDS = [["-c", f"{START}('umf_ros.nodes.pose_graph_node')"], [str(ROOT / "to
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_it_ends_the_process_without_a_word(number: signal.Signals, tmp_path: Path) -> None:
-    (tmp_path / "slow_node.py").write_text("print('loading', flush=True)\nimport time\ntime.sleep(60)\n")
+    (tmp_path / "slow_node.py").write_text(
+        "print('loading', flush=True)\nimport time\nfor _ in range(600):\n    time.sleep(0.1)\n"
+    )
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {START}('slow_node')"
     process = subprocess.Popen(
         [sys.executable, "-c", code], env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
