@@ -56,6 +56,15 @@ def test_a_needed_item_is_never_dropped_once_it_is_taken() -> None:
     assert not late.worker.submit(15, needed=True)
 
 
+def test_an_item_that_waits_is_not_queued_again() -> None:
+    late = HeldUp(queue_size=3)
+    for item in (0, 1, 1, 2, 1):
+        assert late.worker.submit(item, needed=True, once=True)  # 0 is in hand: it waits once more
+    late.gate.set()
+    late.worker.close()
+    assert late.done == [0, 0, 1, 2] and late.worker.dropped == 0
+
+
 def test_submitting_never_waits_for_the_work() -> None:
     gate = threading.Event()
     worker: Worker[int] = Worker(lambda _: gate.wait() and None, lambda _: None, queue_size=2)
