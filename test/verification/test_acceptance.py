@@ -190,7 +190,7 @@ def test_no_rival_makes_a_closure_more_probable_than_none(
     assert shipped.probability(alone | WITHOUT_RIVALS) >= shipped.probability(beside) >= shipped.probability(alone)
 
 
-def test_at_best_no_criterion_of_rivals_is_left_short() -> None:
+def test_without_rivals_no_criterion_of_rivals_is_left_short() -> None:
     assert {scores(BAD | WITHOUT_RIVALS)[name] for name in ("position_along_known", "no_rival")} == {1.0}
 
 

@@ -89,7 +89,7 @@ def coarse_align(match: PreparedScan, query: PreparedScan, guesses: Sequence[Arr
 
     Poses that nothing could have spoken against are left out: two bare planes fit anywhere.
     """
-    poses = [run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M) for guess in guesses]
+    poses = _by_scouts(match, query, guesses)
     reach_m = const.SCOUT_NEAR * query.cell_m
     there = _found_shares(match, [transform(pose, query.scouts) for pose in poses], reach_m)
     back = _found_shares(query, [transform(invert(pose), match.scouts) for pose in poses], reach_m)
@@ -127,9 +127,13 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
     found = []
     for number in np.flatnonzero(match.view.overlap(query.view, turns) >= const.SEARCHED_OVERLAP):
         peaks = _peaks(correlation[:, [number]], np.zeros(1, np.intp), const.PEAKS // 2, query.cell_m)
-        guesses = [lifted(match, query, turns[number], shift) for _, shift in peaks]
-        found += [run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M) for guess in guesses]
+        found += _by_scouts(match, query, [lifted(match, query, turns[number], shift) for _, shift in peaks])
     return [one for one in found if not near(one, pose, const.DISTINCT_M, np.pi / 2)]
+
+
+def _by_scouts(match: PreparedScan, query: PreparedScan, guesses: Sequence[Array]) -> list[Array]:
+    """Poses refined by some steps on a few points."""
+    return [run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M) for guess in guesses]
 
 
 def _correlate(around: Spectra, turned: Spectra, side: int) -> NDArray[np.float32]:
