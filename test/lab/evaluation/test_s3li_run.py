@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from etna import GPS_MINUS_UTC_NS, entries, write_pos
 from recordings import START_NS, write_mcap
+from scipy.spatial.transform import Rotation
 from spread_tasks import die, refuse, square
 from support.s3li_disorders import verdict
 from typer.testing import CliRunner
@@ -145,6 +146,29 @@ def test_headings_come_from_the_odometry_or_else_from_the_course() -> None:
     found, known = headed(truth, asked, None)
     assert np.degrees(heading(found)) == pytest.approx(expected, abs=12)
     assert not headed(truth, asked + 1000 * SECOND, None)[1].any()
+
+
+def test_headings_do_not_drift_with_the_odometry() -> None:
+    stamps, poses = drive(900)
+    truth = positions(stamps, poses)
+    way = np.r_[0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))]
+    drift = Rotation.from_euler("z", np.interp(way, [0, way[-1]], [0, 140])[:, None], degrees=True).as_matrix()
+    steps = np.einsum("nij,nj->ni", drift[1:], np.diff(poses[:, :3, 3], axis=0))
+    drifted = poses.copy()
+    drifted[:, :3, :3] = drift @ poses[:, :3, :3]
+    drifted[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(steps, axis=0)
+    found, _ = headed(truth, stamps, Trajectory(stamps, drifted))
+    off = (np.degrees(heading(found) - heading(poses)) + 180) % 360 - 180
+    assert np.abs(off).max() < 5 and np.median(np.abs(off)) < 1
+
+
+def test_odometry_that_fits_nowhere_leaves_the_course() -> None:
+    stamps, poses = drive(100)
+    truth = positions(stamps, poses)
+    upright = np.eye(4)
+    upright[:3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]
+    found, _ = headed(truth, stamps, Trajectory(stamps, upright @ poses))
+    assert np.array_equal(found, headed(truth, stamps, None)[0])
 
 
 RECORDS = {
