@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,16 +199,16 @@ class CorrectedPath:
         twists = np.zeros((len(points), 6))
         inside = (after > 0) & (after < len(self.points))
         if inside.any():
+            steps, which = np.unique(lower[inside], return_inverse=True)
             noise = points["noise"][inside] - self.points["noise"][lower[inside]]
-            twists[inside] = (noise @ self._multipliers[lower[inside]][..., None])[..., 0]
+            twists[inside] = (noise @ self._multipliers(steps)[which][..., None])[..., 0]
         start = self.poses[lower] @ invert(self.points["pose"][lower])
         return start @ expmap(twists) @ points["pose"]
 
-    @cached_property
-    def _multipliers(self) -> Array:
-        """(N-1, 6) correction from each solved pose to the next per noise: Lagrange multipliers of the solved poses."""
-        here, there = self.points[:-1], self.points[1:]
+    def _multipliers(self, steps: NDArray[np.int64]) -> Array:
+        """(M, 6) corrections from solved poses to the next per noise: Lagrange multipliers of the solved poses."""
+        here, there = self.points[steps], self.points[steps + 1]
         step = invert(here["pose"]) @ there["pose"]
-        misfits = logmap(invert(step) @ invert(self.poses[:-1]) @ self.poses[1:])
+        misfits = logmap(invert(step) @ invert(self.poses[steps]) @ self.poses[steps + 1])
         twists = adjoint(there["pose"]) @ misfits[..., None]
         return np.linalg.solve(there["noise"] - here["noise"], twists)[..., 0]

@@ -367,7 +367,8 @@ class OutlierRejection:
 
     def _of(self, decision: State | ClosureReason) -> NDArray[np.bool_]:
         """Return (N,) whether closures have verdicts of a state or a reason."""
-        return np.array([decision in (verdict.state, verdict.reason) for verdict in self.verdicts], bool)
+        kind = "state" if isinstance(decision, State) else "reason"
+        return np.array([getattr(verdict, kind) is decision for verdict in self.verdicts], bool)
 
     def _accept(self, reasons: dict[int, ClosureReason]) -> bool:
         """Accept closures, and solve the map unless they agree with it; return false without any."""
