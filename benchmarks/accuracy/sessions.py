@@ -3,13 +3,16 @@
     python benchmarks/accuracy/sessions.py --json sessions.json               # five test worlds, some hours
     python benchmarks/accuracy/sessions.py --quick --seed 20001 --json F      # three short sessions, four cold starts
     python benchmarks/accuracy/sessions.py --both-ways --seed 20001           # every second session the other way round
+    python benchmarks/accuracy/sessions.py --grow --quick --seed 20001        # a map that grows where one localises
 
 Every session drives a part of one way of 100 m by a route, light and noise of its own; the world repeats itself
 (aliasing 1.0), and all clocks start at the same second. Recordings and maps stay in `--work` and are taken up again.
 A seed is a world; recordings are seeds + 1, + 2, and so on; the rover that wakes up drives the one after the last.
 With `--both-ways`, every second session and the rover that wakes up drive in the opposite direction, and it wakes up in
 the map of the other sessions, all driven against its direction. The LiDAR is 70 degrees wide. `--lidar-only` leaves out
-the images, which take most of the time.
+the images, which take most of the time. With `--grow`, a map is made of the first session, the second and the third
+localise in it with `localization.update`, and the fourth localises in the map of the first alone and in the grown one;
+prints and writes of both `keyframes`, those with a true closure (`closed`), and `wrong` closures.
 
 Prints and writes, over all worlds:
 - `wrong_between`: closures between sessions that the map believes and the truth refutes (0.5 m, 5 deg);
@@ -25,6 +28,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -52,9 +56,12 @@ from umf_ros.lab.simulation.world import TEST
 from umf_ros.localizer import Localizer, read_poses
 from umf_ros.maps.joint_graph import JointMap, solve
 from umf_ros.maps.map_folder import MapFolder
-from umf_ros.maps.mapping import Opening, add_session, match_session, replay_session, unmatched
+from umf_ros.maps.mapping import Opening, add_session, grow, match_session, replay_session, unmatched
 from umf_ros.maps.outputs import write_results
+from umf_ros.replay import Replay
+from umf_ros.runs.reader import read_run
 from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, absolute_trajectory_error, judge_closures
+from umf_ros.runs.writer import with_places
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
 
@@ -249,6 +256,50 @@ def run_world(world: int, size: Size, work: Path, both_ways: bool) -> dict[str, 
     }
 
 
+def grown(world: int, size: Size, work: Path) -> dict[str, Any]:
+    """Keyframes, closed keyframes and wrong closures of a fourth session in a map of one session, and of three."""
+    work.mkdir(parents=True, exist_ok=True)
+    first, *later, visitor = (simulated(work, world, number, size) for number in range(1, 5))
+    truths = {recording.stem: truth_of(recording) for recording in (first, *later, visitor)}
+    still, growing = mapped(work / "map_still", [first])[0].path, work / "map_growing"
+    for folder in (growing, *(work / f"run_{name}" for name in ("s2", "s3", "still", "growing"))):
+        shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(still, growing)
+    for recording in later:
+        grow(growing, localised(recording, growing, work / f"run_{recording.stem}", update=True))
+    figures: dict[str, Any] = {"world": world, "sessions": len(MapFolder.open(growing).sessions)}
+    for name, folder in (("still", still), ("growing", growing)):
+        run = read_run(localised(visitor, folder, work / f"run_{name}", update=False))
+        sessions = {one.name.removeprefix("run_"): one for one in MapFolder.open(folder).sessions}
+        judged = []
+        for closure in run.closures:
+            of, session = next(item for item in sessions.items() if item[1].covers(closure.match_stamp_ns))
+            query = truths[visitor.stem].at(np.array([closure.query_stamp_ns]))[0]
+            match = truths[of].at(np.array([closure.match_stamp_ns - session.shift_ns]))[0]
+            judged.append(judge_closures([closure], query, match)[0])
+        right = {one.query_stamp_ns for one in judged if one.is_true}
+        figures[name] = {
+            "keyframes": len(run.stamps),
+            "closed": len(right),
+            "wrong": sum(not one.is_true for one in judged),
+        }
+    return figures
+
+
+def localised(recording: Path, map_folder: Path, run: Path, update: bool) -> Path:
+    """Localise a recording in a map; returns the run folder."""
+    run.mkdir()
+    bag = open_bag(recording)
+    chosen = {"mode": "localization", "map": str(map_folder), "localization__update": update}
+    settings = settings_for(bag, None, "auto", **chosen)
+    stored = with_places(settings, run) if update else settings
+    replay = Replay(run, settings, LoopDetector(stored, make_detector_embedder(settings)))
+    for _ in replay.run(FrameReader(bag, settings).stream()):
+        pass
+    replay.finish({})
+    return run
+
+
 def summarise(worlds: list[dict[str, Any]]) -> dict[str, Any]:
     """The figures over all worlds: sums of counts, the worst of the errors, medians of the rest."""
     keyframes = [number for world in worlds for number in world["relocalise_keyframes"]]
@@ -280,6 +331,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="three sessions of 40 s, four cold starts")
     parser.add_argument("--both-ways", action="store_true", help="sessions in both directions, cold starts against it")
+    parser.add_argument("--grow", action="store_true", help="a fourth session in a map that grew, or did not")
     parser.add_argument("--lidar-only", action="store_true", help="without images")
     parser.add_argument("--seed", type=int, help="seed of a single world")
     parser.add_argument(
@@ -290,6 +342,12 @@ def main() -> None:
     size = replace(QUICK if arguments.quick else FULL, images=not arguments.lidar_only)
     kind = ("quick" if arguments.quick else "full") + ("_both_ways" if arguments.both_ways else "")
     kind += "_lidar" if arguments.lidar_only else ""
+    if arguments.grow:
+        found = [grown(world, size, arguments.work / f"{kind}_{world}") for world in seeds(arguments.seed)]
+        print(json.dumps(found, indent=2))
+        if arguments.json is not None:
+            arguments.json.write_text(json.dumps(found, indent=2) + "\n")
+        return
     worlds = []
     for world in seeds(arguments.seed):
         worlds.append(run_world(world, size, arguments.work / f"{kind}_{world}", arguments.both_ways))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -94,6 +96,12 @@ def test_scans_that_are_late_are_told(rng: np.random.Generator, late_s: float) -
     found = overlaid(rng, late_s=late_s)
     assert found is not None and found.lag_s == pytest.approx(-late_s, abs=0.006)
     assert ["the LiDAR's clock is" in line for line in lines(found)] == [True]
+
+
+def test_a_bias_of_matching_is_no_baseline(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "CAMERA", replace(CAMERA, baseline=0.07))
+    found = overlaid(rng, baseline=1.013, frames=60)  # 0.1 of 8 px
+    assert lines(found) == [] and any("does not determine the baseline to 1 %" in line for line in lines(found, "note"))
 
 
 def test_noise_that_hides_a_fault_is_told_instead(rng: np.random.Generator) -> None:
