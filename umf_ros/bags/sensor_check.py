@@ -215,7 +215,7 @@ class Overlay:
         turn_deg: (3,) rotation vector that corrects `body_T_lidar`, body axes.
         scale: depth of stereo over that of the LiDAR.
         lag_s: correction of the LiDAR's stamps to the camera's clock.
-        deviations: (3,) standard deviations of turn (deg, largest axis), scale (bias of matching included), and lag (s).
+        deviations: (3,) standard deviations of turn (deg, largest axis), scale (with bias of matching), and lag (s).
     """
 
     turn_deg: Array
