@@ -367,7 +367,8 @@ class SensorCheck:
             disparity = disparities(frame.left, frame.right, pixels[chosen], camera)
             known = np.isfinite(disparity)
             chosen = chosen[known]
-            self._overlaid.append(overlay_equations(frame, disparity[known], pixels[chosen], chosen))
+            if len(chosen):
+                self._overlaid.append(overlay_equations(frame, disparity[known], pixels[chosen], chosen))
 
     def _step(self, earlier: Frame, later: Frame) -> None:
         if len(self._scan_steps) + len(self._view_steps) >= 2 * MAX_STEPS:

@@ -144,8 +144,8 @@ def headed(truth: Trajectory, stamps: NDArray[np.int64], odometry: Trajectory | 
         return poses, known
     positions = poses[rows, :3, 3]
     rotations = course(positions)
-    if odometry is not None:
-        estimate, heard = odometry.at(stamps[rows])
+    estimate, heard = odometry.at(stamps[rows]) if odometry is not None else (poses, np.zeros(len(rows), bool))
+    if heard.any():
         turned, fits = turned_rotations(estimate[heard], positions[heard])
         rotations[np.flatnonzero(heard)[fits]] = turned[fits]
     poses[rows] = poses_of(rotations, positions)
