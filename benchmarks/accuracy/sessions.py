@@ -31,6 +31,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ from umf_ros.lab.simulation.simulator import Simulator, record
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.localizer import Localizer, read_poses
 from umf_ros.maps.joint_graph import JointMap, solve
-from umf_ros.maps.map_folder import MapFolder
+from umf_ros.maps.map_folder import MapFolder, MapSession
 from umf_ros.maps.mapping import Opening, add_session, grow, match_session, replay_session, unmatched
 from umf_ros.maps.outputs import write_results
 from umf_ros.replay import Replay
@@ -154,15 +155,15 @@ def judge(joint: JointMap, truths: dict[str, Trajectory], summary: dict[str, Any
 
 def wrong_closures(joint: JointMap, truths: dict[str, Trajectory], closures: list[Any]) -> int:
     """How many closures the truth refutes."""
-
-    def true_pose(map_ns: int) -> Array:
-        session = next(one.session for one in joint.sessions if one.session.covers(map_ns))
-        return truths[session.name].at(np.array([map_ns - session.shift_ns]))[0][0]
-
-    judged = [
-        judge_closures([c], true_pose(c.query_stamp_ns)[None], true_pose(c.match_stamp_ns)[None])[0] for c in closures
-    ]
+    true = partial(true_pose, [one.session for one in joint.sessions], truths)
+    judged = [judge_closures([c], true(c.query_stamp_ns)[None], true(c.match_stamp_ns)[None])[0] for c in closures]
     return sum(not one.is_true for one in judged)
+
+
+def true_pose(sessions: list[MapSession], truths: dict[str, Trajectory], map_ns: int) -> Array:
+    """The true pose (4, 4) at a stamp of the map; a session that grew the map is named after its run."""
+    session = next(one for one in sessions if one.covers(map_ns))
+    return truths[session.name.removeprefix("run_")].at(np.array([map_ns - session.shift_ns]))[0][0]
 
 
 def overlapping_apart(joint: JointMap, truths: dict[str, Trajectory]) -> int:
@@ -270,13 +271,10 @@ def grown(world: int, size: Size, work: Path) -> dict[str, Any]:
     figures: dict[str, Any] = {"world": world, "sessions": len(MapFolder.open(growing).sessions)}
     for name, folder in (("still", still), ("growing", growing)):
         run = read_run(localised(visitor, folder, work / f"run_{name}", update=False))
-        sessions = {one.name.removeprefix("run_"): one for one in MapFolder.open(folder).sessions}
-        judged = []
+        sessions, judged = MapFolder.open(folder).sessions, []
         for closure in run.closures:
-            of, session = next(item for item in sessions.items() if item[1].covers(closure.match_stamp_ns))
             query = truths[visitor.stem].at(np.array([closure.query_stamp_ns]))[0]
-            match = truths[of].at(np.array([closure.match_stamp_ns - session.shift_ns]))[0]
-            judged.append(judge_closures([closure], query, match)[0])
+            judged += judge_closures([closure], query, true_pose(sessions, truths, closure.match_stamp_ns)[None])
         right = {one.query_stamp_ns for one in judged if one.is_true}
         figures[name] = {
             "keyframes": len(run.stamps),

@@ -168,11 +168,14 @@ def test_baselines_by_name():
 
 
 NEW = """
+import numpy as np
+from umf_ros.core.frames import Embedding
+
 class Nowhere:
     name, dimension = "nowhere", 3
 
     def embed(self, frame):
-        raise NotImplementedError
+        return Embedding(descriptor=np.eye(3, dtype=np.float32)[frame.stamp_ns])
 
 def make(settings, asked):
     return Nowhere()
@@ -188,13 +191,14 @@ def test_a_package_of_a_user_adds_a_method_by_an_entry_point(tmp_path):
     code = (
         "from umf_ros.core.config import EmbeddingSettings as S; from umf_ros.core.errors import ConfigError\n"
         "from umf_ros.embedding import find_methods, make_embedder\n"
-        "print(find_methods()[0], 'nowhere' in find_methods(), make_embedder(S(method='nowhere')).dimension)\n"
+        "from types import SimpleNamespace as Frame; made = make_embedder(S(method='nowhere'))\n"
+        "print(find_methods()[0], 'nowhere' in find_methods(), *made.embed(Frame(stamp_ns=1)).descriptor)\n"
         "try:\n    make_embedder(S(method='broken'))\nexcept ConfigError as error:\n    print(error)"
     )
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{Path(embedding.__file__).parents[2]}"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     first, second = done.stdout.splitlines()
-    assert first == "umf True 3"
+    assert first == "umf True 0.0 1.0 0.0"
     assert second.startswith("embedding.method broken: its entry point cannot be loaded:")
 
 

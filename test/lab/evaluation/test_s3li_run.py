@@ -18,12 +18,12 @@ from umf_ros.core.config import Loop
 from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import heading
 from umf_ros.core.trajectory import Trajectory, write_tum
+from umf_ros.lab.datasets.s3li import headed
 from umf_ros.lab.datasets.s3li_folder import S3liFolder, S3liSequence
 from umf_ros.lab.datasets.simulated import poses_of
 from umf_ros.lab.evaluation.s3li_run import (
     S3liRun,
     clock_lag_s,
-    headed,
     in_own_process,
     latex,
     pooled,

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
 from umf_ros.bags.frames import FrameReader
@@ -34,7 +33,7 @@ from umf_ros.core.io import read_values, write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.embedding import make_embedder
-from umf_ros.lab.datasets.s3li import ETNA_TEST, MAX_MISFIT, load_data_frame, read_toolkit
+from umf_ros.lab.datasets.s3li import ETNA_TEST, headed, load_data_frame, read_toolkit
 from umf_ros.lab.datasets.s3li_folder import (
     Pair,
     S3liFolder,
@@ -46,7 +45,6 @@ from umf_ros.lab.datasets.s3li_folder import (
     read_stereo,
     truth_of,
 )
-from umf_ros.lab.datasets.simulated import course, path_length, poses_of
 from umf_ros.lab.evaluation.bag_run import sequence_set
 from umf_ros.lab.evaluation.results import TextTable
 from umf_ros.lab.evaluation.retrieval import THESIS_RULE, Mask, loop_closure, rank
@@ -65,9 +63,6 @@ Record = dict[str, Any]
 
 MPRF_APART_S = 100.0
 """A query retrieves nothing that is nearer in time (MPRF, `time_threshold`)."""
-HEADING_WINDOW_M = 20.0
-"""Way before and after a pose on which odometry is turned to the satellites' positions, long beside their noise; with
-the drift of the twin's crater, 140 degrees in a kilometre, R@1 is the same for 5 to 40 m."""
 FIXED = 1
 """Quality of positions that relative poses are judged by: a float solution is off by decimetres."""
 ENOUGH_FIXED, LARGEST_LAG_S, LAG_STEP_S, LAG_WINDOW_S = 0.5, 30.0, 0.5, 40.0
@@ -129,45 +124,6 @@ def precision_of_pairs(
     true &= apart
     ranking = rank(descriptors @ descriptors.T, apart)
     return np.asarray(ranking.hits(true)[:, :1].any(axis=1)), np.asarray(true.any(axis=1))
-
-
-def headed(truth: Trajectory, stamps: NDArray[np.int64], odometry: Trajectory | None) -> tuple[Array, Mask]:
-    """True poses (N, 4, 4): positions by satellites, rotations of the odometry, turned to them about the vertical.
-
-    Each pose is turned by the way around it, so its heading is right however far the odometry has drifted. Without
-    odometry, or where the two differ by more than a tenth of that way, the course over ground is the heading. Second
-    comes (N,) whether each is known.
-    """
-    poses, known = truth.at(stamps)
-    rows = np.flatnonzero(known)
-    if not len(rows):
-        return poses, known
-    positions = poses[rows, :3, 3]
-    rotations = course(positions)
-    estimate, heard = odometry.at(stamps[rows]) if odometry is not None else (poses, np.zeros(len(rows), bool))
-    if heard.any():
-        turned, fits = turned_rotations(estimate[heard], positions[heard])
-        rotations[np.flatnonzero(heard)[fits]] = turned[fits]
-    poses[rows] = poses_of(rotations, positions)
-    return poses, known
-
-
-def turned_rotations(estimate: Array, positions: Array) -> tuple[Array, Mask]:
-    """(N, 3, 3) rotations of (N, 4, 4) poses with z up, each turned about z to fit (N, 3) positions on the way around.
-
-    Second comes (N,) whether they fit.
-    """
-    way = path_length(positions)
-    turns, fits = np.zeros(len(way)), np.zeros(len(way), bool)
-    plane = estimate[:, 0, 3] + 1j * estimate[:, 1, 3], positions[:, 0] + 1j * positions[:, 1]
-    for row, here in enumerate(way):
-        around = slice(*np.searchsorted(way, (here - HEADING_WINDOW_M, here + HEADING_WINDOW_M)))
-        ours, theirs = (one[around] - one[around].mean() for one in plane)
-        turn = np.vdot(ours, theirs)  # of least squares, in the plane [Kabsch 1976]
-        turns[row] = np.angle(turn)
-        misfit = np.sqrt(np.mean(np.abs(ours * np.exp(1j * turns[row]) - theirs) ** 2))
-        fits[row] = turn != 0 and misfit < MAX_MISFIT * (way[around][-1] - way[around][0])
-    return Rotation.from_euler("z", turns[:, None]).as_matrix() @ estimate[:, :3, :3], fits
 
 
 def clock_lag_s(odometry: Trajectory, truth: Trajectory) -> float:
