@@ -274,7 +274,8 @@ def grown(world: int, size: Size, work: Path) -> dict[str, Any]:
         sessions, judged = MapFolder.open(folder).sessions, []
         for closure in run.closures:
             query = truths[visitor.stem].at(np.array([closure.query_stamp_ns]))[0]
-            judged += judge_closures([closure], query, true_pose(sessions, truths, closure.match_stamp_ns)[None])
+            match = true_pose(sessions, truths, closure.match_stamp_ns)[None]
+            judged.append(judge_closures([closure], query, match)[0])
         right = {one.query_stamp_ns for one in judged if one.is_true}
         figures[name] = {
             "keyframes": len(run.stamps),
