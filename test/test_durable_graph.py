@@ -16,6 +16,7 @@ from umf_ros.durable_graph import DurableGraph
 from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.live.live_graph import settle_left
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
+from umf_ros.sensors.sessions import CONFIRMING
 
 SETTINGS = PoseGraphSettings(max_gap_s=3)
 
@@ -70,7 +71,7 @@ def test_a_revoked_closure_stays_revoked(world: GraphWorld, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("pause_s", "moved_m", "sessions"), [(10, 1.0, 1), (10, 300.0, 2), (3600, 1.0, 2), (-50, 0, 2)]
+    ("pause_s", "moved_m", "sessions"), [(10, 1.0, 1), (10, 300.0, 2), (3600, 1.0, 1), (3600, 300.0, 2), (-50, 0, 2)]
 )
 def test_odometry_goes_on_after_a_restart_only_if_it_can_be_the_same(
     world: GraphWorld, tmp_path: Path, pause_s: int, moved_m: float, sessions: int
@@ -81,7 +82,8 @@ def test_odometry_goes_on_after_a_restart_only_if_it_can_be_the_same(
     again = made(tmp_path / "graph.sqlite")
     pose = world.odometry[49].copy()
     pose[0, 3] += moved_m
-    again.take_odometry(50 * PERIOD_NS + pause_s * 10**9, pose)
+    for i in range(CONFIRMING):
+        again.take_odometry((50 + i) * PERIOD_NS + pause_s * 10**9, pose)
     assert len(again.graph._sessions.chains) == sessions
 
 
@@ -90,7 +92,8 @@ def test_odometry_that_begins_at_its_origin_is_another(world: GraphWorld, tmp_pa
     drive(graph, world, 0, 3)
     graph.close()
     again = made(tmp_path / "graph.sqlite")
-    assert again.take_odometry(4 * PERIOD_NS, np.eye(4)) is not None
+    resets = [again.take_odometry((8 + i) * PERIOD_NS, np.eye(4)) for i in range(CONFIRMING)]
+    assert resets[-1] is not None and "origin" in resets[-1].reason
 
 
 def test_closures_that_are_told_again_after_a_restart_count_once(world: GraphWorld, tmp_path: Path) -> None:
@@ -98,7 +101,8 @@ def test_closures_that_are_told_again_after_a_restart_count_once(world: GraphWor
     drive(graph, world, 0, len(world.truth))
     graph.close()
     again = made(tmp_path / "graph.sqlite")
-    again.take_odometry(10**18, np.eye(4))  # another session begins
+    for i in range(CONFIRMING):  # another session begins
+        again.take_odometry(10**18 + i * PERIOD_NS, np.eye(4))
     told = [verdict.closure for verdict in graph.graph.closures()]
     for closure in told:
         again.add_closure(closure)

@@ -246,7 +246,6 @@ class DurableGraph:
             except GraphError:
                 self.graph.counts["closure decided by hand not found"] += 1
         if last is not None:
-            self.feed.interrupted()
             self._log(STARTED)
         self._write(f"PRAGMA user_version = {self._mark}")
         found = self.graph.closures()
@@ -271,8 +270,6 @@ class DurableGraph:
                 yield AbsoluteMeasurement.stored(kind, first_ns, numbers)
             elif kind in BY_HAND:
                 decided[first_ns, second_ns] = BY_HAND[kind]
-            elif kind == STARTED:
-                self.feed.interrupted()
 
     def _logged(self, verdicts: list[ClosureVerdict]) -> list[ClosureVerdict]:
         rows = [(*v.closure.pair, v.state.value, v.reason, v.residual, v.residual_m) for v in verdicts]

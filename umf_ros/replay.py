@@ -194,6 +194,7 @@ class Replay:
         if self._detector.inter_robot is not None:
             for inter_closure in self._detector.inter_robot.finish(FLEET_PATIENCE_S):
                 self._recorder.record_inter_robot(inter_closure)
+        self._feed.finish()
         has_trajectory = self._has_odometry if self._localizer is None else bool(self.counts["located"])
         if has_trajectory:
             self._graph.write_results(self._folder)

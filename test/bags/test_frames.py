@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,17 @@ def test_odometry_can_come_from_a_file(tmp_path: Path) -> None:
     for frame in frames:
         assert frame.odom_T_body is not None
         assert np.allclose(frame.odom_T_body, drive((frame.stamp_ns - START_NS) / 1e9), atol=2e-3)
+
+
+@pytest.mark.parametrize("wrong_s", [0, 3600])
+def test_odometry_is_compared_with_headers_and_not_with_times_of_recording(tmp_path: Path, wrong_s: int) -> None:
+    """Also where the first header is wrong."""
+    entries = [(topic, at + 10**18, copy.deepcopy(message)) for topic, at, message in ENTRIES if topic != ODOMETRY]
+    entries[0][2].header.stamp.sec += wrong_s
+    seconds = np.arange(0, 4, 0.1)
+    path = Trajectory(START_NS + np.round(seconds * 1e9).astype(np.int64), np.stack([drive(s) for s in seconds]))
+    frames = list(FrameReader(open_bag(write_mcap(tmp_path / "a.mcap", entries)), small_settings(tmp_path), path))
+    assert sum(frame.odom_T_body is not None for frame in frames) >= SCANS - 1
 
 
 def test_odometry_of_another_recording_is_said(tmp_path: Path) -> None:

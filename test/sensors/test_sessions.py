@@ -7,7 +7,7 @@ import pytest
 from recordings import drive
 
 from umf_ros.core.geometry import Array, make_pose
-from umf_ros.sensors.sessions import DROPPED, Input, OdometrySessionSplitter, SessionClock, StampedInput
+from umf_ros.sensors.sessions import CONFIRMING, DROPPED, Input, OdometrySessionSplitter, SessionClock, StampedInput
 
 S = 10**9
 T0 = 1_625_680_800 * S
@@ -50,29 +50,30 @@ def test_two_inputs_that_went_back_agree_and_the_clock_runs_anew() -> None:
 
 
 def test_what_comes_late_from_before_a_reset_is_stale() -> None:
-    clock = heard(("left", 5.0), ("cloud", 9.0), ("left", 0.5), ("left", 0.6))
+    clock = heard(("left", 5.0), ("cloud", 9.0), *(("left", 0.5 + i / 10) for i in range(CONFIRMING)))
     assert clock.session == 1
     # nearer to the end of the session before than to the new beginning
-    assert faults(clock, "cloud", 8.9) == ["stale"] and faults(clock, "cloud", 0.7) == [""]
+    assert faults(clock, "cloud", 8.9) == ["stale"] and faults(clock, "cloud", 0.9) == [""]
 
 
 def test_what_is_still_held_at_the_end_was_wrong() -> None:
     clock = heard(("left", 5.0), ("odometry", 5.0), ("left", 1.0))
     clock.take(StampedInput("odometry", ns(5.1), make_pose(np.eye(3), [50, 0, 0])))
-    assert [(one.name, one.fault) for one in clock.drop_held()] == [
+    assert [(one.name, one.fault) for one in clock.finish()] == [
         ("left", "clock jump"),
         ("odometry", "position jump"),
     ]
-    assert clock.drop_held() == [] and clock.session == 0
+    assert clock.finish() == [] and clock.session == 0
 
 
 def test_an_odometry_reset_leaves_the_other_inputs_in_line() -> None:
     clock = heard(("left", 5.0), ("odometry", 5.0))
     away = make_pose(np.eye(3), [50, 0, 0])
-    assert clock.take(StampedInput("odometry", ns(5.1), away)) == (None, [])
+    for second in (5.1, 5.15, 5.2):
+        assert clock.take(StampedInput("odometry", ns(second), away)) == (None, [])
     assert faults(clock, "left", 5.1) == [""]
-    reset, decided = clock.take(StampedInput("odometry", ns(5.2), away))
-    assert reset is not None and not reset.of_clock and [one.fault for one in decided] == ["", ""]
+    reset, decided = clock.take(StampedInput("odometry", ns(5.25), away))
+    assert reset is not None and not reset.of_clock and [one.fault for one in decided] == [""] * CONFIRMING
     assert faults(clock, "left", 5.1) == ["duplicate"]
 
 

@@ -72,7 +72,7 @@ def test_usable_stamps_of_an_input_rise_within_a_session(messages: list[tuple[In
                 key = (clock.session, one.name)
                 assert one.stamp_ns > newest.get(key, -1)
                 newest[key] = one.stamp_ns
-    assert returned + len(clock.drop_held()) == len(messages)
+    assert returned + len(clock.finish()) == len(messages)
 
 
 @given(st.integers(1, 3600), st.integers(7, 3600))

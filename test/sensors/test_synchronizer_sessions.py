@@ -8,6 +8,7 @@ from streams import T0, S, check_accounts, feed, in_order, rover, same
 
 from umf_ros.core.config import Sync
 from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.sessions import CONFIRMING
 from umf_ros.sensors.synchronizer import Synchronizer
 
 
@@ -79,8 +80,8 @@ def test_stragglers_of_the_session_before_do_not_start_another_one(calibration: 
     synchronizer = Synchronizer(Sync(), calibration)
     late_clouds = streams["cloud"][-2:]
     feed(synchronizer, [item for item in in_order(streams) if item not in late_clouds and item[1] < T0 + 3.8 * S])
-    feed(synchronizer, streams["left"][:3] + late_clouds)
-    frames = feed(synchronizer, in_order({**streams, "left": streams["left"][3:]})) + synchronizer.flush()
+    feed(synchronizer, streams["left"][:CONFIRMING] + late_clouds)
+    frames = feed(synchronizer, in_order({**streams, "left": streams["left"][CONFIRMING:]})) + synchronizer.flush()
     assert synchronizer.session == 1
     assert synchronizer.counters["cloud"].dropped == {"stale": 2}
     assert sum(frame.session == 1 for frame in frames) == len(streams["cloud"])

@@ -11,7 +11,7 @@ import numpy as np
 
 from umf_ros.absolute.measurement import ABSOLUTE_TYPES, AbsoluteDecoder, AbsoluteMeasurement, Aid
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
-from umf_ros.bags.reader import Bag, RawMessage, decode
+from umf_ros.bags.reader import Bag, RawMessage, decode, stamp_span
 from umf_ros.bags.trajectories import decode_ground_truth
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics, topics_of
@@ -55,7 +55,7 @@ class FrameReader:
         topics = _present(topics_of(settings), bag)
         check_inputs(settings.embedding.method, bag.path, bool(topics.left_image), bool(topics.cloud))
         if odometry is not None:
-            _check_overlap(odometry, bag)
+            _check_overlap(odometry, bag, {topics.cloud, topics.left_image})
             topics = topics.model_copy(update={"odometry": ""})
         inputs = wanted_inputs(topics) | ({ODOMETRY} if odometry is not None else set())
         calibration = calibration_of(settings)
@@ -167,8 +167,9 @@ def _present(topics: Topics, bag: Bag) -> Topics:
     return present
 
 
-def _check_overlap(odometry: Trajectory, bag: Bag) -> None:
-    if odometry.stamps_ns[-1] < bag.start_ns or odometry.stamps_ns[0] > bag.end_ns:
+def _check_overlap(odometry: Trajectory, bag: Bag, topics: set[str]) -> None:
+    first_ns, last_ns = stamp_span(bag, topics)
+    if odometry.stamps_ns[-1] < first_ns or odometry.stamps_ns[0] > last_ns:
         seconds = " to ".join(f"{stamp * 1e-9:.1f}" for stamp in (odometry.stamps_ns[0], odometry.stamps_ns[-1]))
-        recorded = f"{bag.start_ns * 1e-9:.1f} to {bag.end_ns * 1e-9:.1f}"
+        recorded = f"{first_ns * 1e-9:.1f} to {last_ns * 1e-9:.1f}"
         raise BagError(f"the odometry file covers none of the recording: {seconds} s against {recorded} s")

@@ -8,9 +8,10 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from rosbags.typesys.store import Typestore
 from zstandard import ZstdError, frame_content_size
 
 from umf_ros.core.errors import BagError, MessageError, check_utf8, one_line, reading
-from umf_ros.sensors.decode import LIVOX
+from umf_ros.sensors.decode import LIVOX, stamp_ns
 
 LARGEST_CHUNK = 2**28
 """Most bytes of an unpacked chunk, and of any record; recorders write some megabytes."""
@@ -342,6 +343,10 @@ def _in_number_order(paths: Iterable[Path]) -> list[Path]:
     return sorted(paths, key=number)
 
 
+OFFSETS = 9
+"""Messages whose median offset between header and time of recording counts: single stamps may be wrong."""
+
+
 class Bag:
     """A recording: its topics by name, and its messages, any number of times.
 
@@ -392,6 +397,24 @@ class Bag:
                 yield raw.topic, raw.log_ns, decode(raw)
             except MessageError as error:
                 raise BagError(f"{self.path}: {raw.topic}: {error}") from None
+
+
+def stamp_span(bag: Bag, topics: Collection[str]) -> tuple[int, int]:
+    """Return the first and the last stamp in ns of a recording by the clock of its headers.
+
+    Times of recording are of another clock: a camera synchronised to TAI, a computer without a clock, an old recording
+    that was recorded again. The first messages on these topics tell the offset; without any it is 0.
+
+    Raises:
+        BagError: a message does not match its type.
+    """
+    offsets = []
+    for _, log_ns, message in islice(bag.messages(topics), OFFSETS):
+        with suppress(MessageError):
+            offsets.append(stamp_ns(message) - log_ns)
+    offsets = sorted(offsets) or [0]
+    offset_ns = offsets[len(offsets) // 2]
+    return bag.start_ns + offset_ns, bag.end_ns + offset_ns
 
 
 def decode(raw: RawMessage) -> Any:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.bags.reader import Bag
+from umf_ros.bags.reader import Bag, stamp_span
 from umf_ros.bags.trajectories import read_tum
-from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.config import Settings, load_settings, topics_of
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure, Points
 from umf_ros.core.trajectory import Trajectory
@@ -110,13 +110,15 @@ def remember_recording(folder: Path, bag: Bag, **more: Any) -> None:
 
 
 def _check_recording(run: FinishedRun, bag: Bag) -> None:
-    """Refuse to judge a run by another recording."""
-    known = run.summary.get("recording")
-    if known and (known["start_ns"], known["messages"]) != (bag.start_ns, describe_recording(bag)["messages"]):
-        raise UmfError(f"{run.folder} was made on another recording, {known['path']}; nothing was written")
-    first, last = bag.start_ns - CLOCK_SLACK_NS, bag.end_ns + CLOCK_SLACK_NS
-    outside = run.stamps[(run.stamps < first) | (run.stamps > last)]
-    if len(outside):
+    """Refuse to judge a run by another recording: of another start or other messages, or of another time."""
+    if known := run.summary.get("recording"):
+        if (known["start_ns"], known["messages"]) != (bag.start_ns, describe_recording(bag)["messages"]):
+            raise UmfError(f"{run.folder} was made on another recording, {known['path']}; nothing was written")
+        return
+    topics = topics_of(run.settings)
+    first_ns, last_ns = stamp_span(bag, {topics.cloud, topics.left_image})
+    outside = run.stamps[(run.stamps < first_ns - CLOCK_SLACK_NS) | (run.stamps > last_ns + CLOCK_SLACK_NS)]
+    if 2 * len(outside) > len(run.stamps):
         raise UmfError(
             f"{run.folder} was made on another recording than {bag.path}: {len(outside)} of {len(run.keyframes)} "
             f"keyframes are outside its time, the first at {outside[0]} ns; nothing was written"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from umf_ros.core.geometry import Array
+from umf_ros.core.geometry import Array, rotation_angle
 
 Input = Literal["left", "right", "cloud", "odometry", "camera_info"]
 ODOMETRY: Input = "odometry"
@@ -18,8 +19,17 @@ CLOCK_STEP_NS = 1_000_000_000
 """A stamp this much older than the newest of its input means that the clock was set back."""
 AGREEMENT_NS = 5_000_000_000
 """Two messages out of line belong to the same new session when their stamps lie this close together."""
-FASTEST_M_PER_S = 20.0
-LEAST_JUMP_M = 2.0
+CONFIRMING = 4
+"""Messages of one input that have to go on from each other, out of line, before they are believed: some drivers stamp
+up to three in a row wrongly (*by hand*)."""
+SILENCE_NS = 100_000_000
+"""Shortest gap that is a silence; of slower inputs `USUAL_GAPS` times their period."""
+USUAL_GAPS = 3
+PERIODS = 9
+AHEAD_NS = 500_000_000
+"""Shortest gap after which the next stamp may be ahead of time."""
+FASTEST_M_PER_S, FASTEST_RAD_PER_S = 20.0, 6.0
+LEAST_JUMP_M, LEAST_JUMP_RAD = 2.0, 0.7
 DROPPED = ("clock jump", "position jump")
 """Faults of messages that were held and then dropped."""
 
@@ -47,13 +57,29 @@ class Reset:
     of_clock: bool
 
 
-class SessionClock:
-    """Clock of some inputs, which distinguishes a session reset from a single wrong message.
+@dataclass(slots=True)
+class _Held:
+    """Messages of one input out of line, each going on from the one before; without a reset they are ahead of time."""
 
-    A message out of line with the newest of its input (its stamp went back, or the odometry jumped) is held until
-    another agrees with it: of its own input one that continues from it or, where the stamps went back, one of any
-    input. Then a new session begins. When its input continues as before, the message is dropped. `session` counts the
-    resets; `start_ns` is the first stamp on this clock.
+    reset: Reset | None
+    messages: list[StampedInput]
+
+    @property
+    def last(self) -> StampedInput:
+        return self.messages[-1]
+
+    @property
+    def is_of_clock(self) -> bool:
+        return self.reset is None or self.reset.of_clock
+
+
+class SessionClock:
+    """Clock of some inputs, which distinguishes a session reset from single wrong messages.
+
+    A message out of line with the newest of its input is held: its stamp went back, its stamp is ahead of all inputs
+    after a gap, or the odometry jumped. It is believed once `CONFIRMING` messages of its input go on from each other,
+    or, for stamps, once another sensor agrees; then a new session begins, or, after a gap, the messages pass. When its
+    input continues as before, it is dropped. `session` counts the resets; `start_ns` is the first stamp on this clock.
     """
 
     def __init__(self) -> None:
@@ -62,7 +88,9 @@ class SessionClock:
         self.start_ns = 0
         self._previous_end_ns: int | None = None
         self._newest: dict[Input, StampedInput] = {}
-        self._held: dict[Input, tuple[StampedInput, Reset]] = {}
+        self._held: dict[Input, _Held] = {}
+        self._periods_ns: dict[Input, deque[int]] = {}
+        self._motion = OdometryMotion()
 
     def newest_ns(self, *names: Input) -> int | None:
         """Return the latest stamp of some inputs on this clock, or None before their first."""
@@ -74,41 +102,76 @@ class SessionClock:
         Dropped messages come first, then those of the running session in the order of their arrival; none while the
         message is held.
         """
-        newest = self._newest.get(arrival.name)
-        reset = None if newest is None else _reset(newest, arrival)
-        if reset is None:
+        found = self._doubt(arrival)
+        if found is None:
             return None, [*self._drop({arrival.name}), self._advance(arrival)]
-        agreeing = [name for name, held in self._held.items() if _agree(*held, arrival, reset)]
-        if agreeing:
-            return self._begin(agreeing, arrival)
-        dropped = self._drop({arrival.name})
-        self._held[arrival.name] = arrival, reset
-        return None, dropped
+        held, dropped = self._held.get(arrival.name), list[StampedInput]()
+        if held is not None and _goes_on(held, found, arrival):
+            held.messages.append(arrival)
+        else:
+            dropped = self._drop({arrival.name})
+            held = self._held[arrival.name] = found
+        agreeing = [name for name, other in self._held.items() if _agree(held, other)]
+        if len(held.messages) < CONFIRMING and len(agreeing) == 1:
+            return None, dropped
+        reset = self._held[agreeing[0]].reset
+        return reset, dropped + self._believe(agreeing, reset)
 
     @property
     def held(self) -> int:
         """Number of messages that are not decided yet."""
-        return len(self._held)
+        return sum(len(held.messages) for held in self._held.values())
 
-    def drop_held(self) -> list[StampedInput]:
-        """Drop the messages that are still held, at the end of the stream."""
-        return self._drop(set(self._held))
+    def finish(self) -> list[StampedInput]:
+        """Decide about the messages that are still held, at the end of the stream: those after a gap pass."""
+        late = [one for held in self._held.values() if held.reset is None for one in held.messages]
+        dropped = self._drop({name for name, held in self._held.items() if held.reset is not None})
+        self._held.clear()
+        return [*dropped, *(self._advance(one) for one in sorted(late, key=lambda one: one.stamp_ns))]
 
-    def _begin(self, agreeing: list[Input], arrival: StampedInput) -> tuple[Reset, list[StampedInput]]:
-        held = [self._held.pop(name) for name in agreeing]
-        reset = held[0][1]
-        self.session += 1
-        if reset.of_clock:
-            self._previous_end_ns, self._now_ns = self._now_ns, None
-            self._newest.clear()
-        else:
-            del self._newest[arrival.name]
-        dropped = self._drop(set(self._held) if reset.of_clock else {arrival.name})
-        return reset, [*dropped, *(self._advance(one) for one, _ in held), self._advance(arrival)]
+    def _doubt(self, arrival: StampedInput) -> _Held | None:
+        """Return a message that is out of line with the reason; None when it continues its input."""
+        newest = self._newest.get(arrival.name)
+        if newest is None:
+            return None
+        elapsed_ns, silence_ns = arrival.stamp_ns - newest.stamp_ns, self._silence_ns(arrival.name)
+        if elapsed_ns <= -CLOCK_STEP_NS:
+            return _Held(Reset(f"the clock of the {arrival.name} went back", of_clock=True), [arrival])
+        if arrival.name == ODOMETRY:
+            held = self._held.get(ODOMETRY)
+            if held is not None and not held.is_of_clock and _is_nearer(held.last.value, newest.value, arrival.value):
+                return _Held(held.reset, [arrival])
+            if reason := self._motion.contradiction(elapsed_ns, arrival.value, elapsed_ns > silence_ns):
+                return _Held(Reset(reason, of_clock=False), [arrival])
+        now_ns = max(one.stamp_ns for one in self._newest.values())
+        return _Held(None, [arrival]) if arrival.stamp_ns - now_ns > max(silence_ns, AHEAD_NS) else None
+
+    def _silence_ns(self, name: Input) -> int:
+        """Return the gap of an input that is a silence."""
+        periods = sorted(self._periods_ns.get(name, ()))
+        return max(SILENCE_NS, USUAL_GAPS * (periods[len(periods) // 2] if periods else CLOCK_STEP_NS))
+
+    def _believe(self, agreeing: list[Input], reset: Reset | None) -> list[StampedInput]:
+        """Let held messages pass, the first of a new session if there is a reset; return what is decided."""
+        believed = [one for name in agreeing for one in self._held.pop(name).messages]
+        dropped: list[StampedInput] = []
+        if reset is not None:
+            self.session += 1
+            self._motion = OdometryMotion()
+            if reset.of_clock:
+                self._previous_end_ns, self._now_ns = self._now_ns, None
+                self._newest.clear()
+                dropped = self._drop(set(self._held))
+            else:
+                del self._newest[ODOMETRY]
+        return [*dropped, *(self._advance(one) for one in believed)]
 
     def _drop(self, names: set[Input]) -> list[StampedInput]:
-        pairs = [self._held.pop(name) for name in list(self._held) if name in names]
-        return [replace(one, fault=DROPPED[0] if reset.of_clock else DROPPED[1]) for one, reset in pairs]
+        return [
+            replace(one, fault=DROPPED[0] if held.is_of_clock else DROPPED[1])
+            for held in [self._held.pop(name) for name in list(self._held) if name in names]
+            for one in held.messages
+        ]
 
     def _advance(self, arrival: StampedInput) -> StampedInput:
         """Record a message that is in line, and return its fault."""
@@ -117,6 +180,11 @@ class SessionClock:
             return replace(arrival, fault="stale")
         if newest is not None and arrival.stamp_ns <= newest.stamp_ns:
             return replace(arrival, fault="duplicate" if arrival.stamp_ns == newest.stamp_ns else "out of order")
+        if newest is not None:
+            periods = self._periods_ns.setdefault(arrival.name, deque(maxlen=PERIODS))
+            periods.append(arrival.stamp_ns - newest.stamp_ns)
+        if arrival.name == ODOMETRY:
+            self._motion.add(arrival.stamp_ns, arrival.value)
         # an image is not kept alive for its stamp
         self._newest[arrival.name] = (
             arrival if arrival.name == ODOMETRY else StampedInput(arrival.name, arrival.stamp_ns)
@@ -133,26 +201,111 @@ class SessionClock:
         return abs(self._previous_end_ns - stamp_ns) < stamp_ns - self._now_ns
 
 
-def _reset(before: StampedInput, after: StampedInput) -> Reset | None:
-    """Return the reset between two messages of an input; None when the second continues from the first."""
-    elapsed_ns = after.stamp_ns - before.stamp_ns
-    if elapsed_ns <= -CLOCK_STEP_NS:
-        return Reset(f"the clock of the {after.name} went back", of_clock=True)
-    if after.name != ODOMETRY:
-        return None
-    jump_m = float(np.linalg.norm(after.value[:3, 3] - before.value[:3, 3]))
-    if jump_m > max(LEAST_JUMP_M, FASTEST_M_PER_S * abs(elapsed_ns) * 1e-9):
-        return Reset(f"the odometry jumped by {jump_m:.0f} m", of_clock=False)
-    return None
-
-
-def _agree(held: StampedInput, why: Reset, arrival: StampedInput, reset: Reset) -> bool:
-    """Return whether two messages out of line belong to the same new session."""
-    if abs(arrival.stamp_ns - held.stamp_ns) > AGREEMENT_NS:
+def _goes_on(held: _Held, found: _Held, arrival: StampedInput) -> bool:
+    """Return whether a message out of line continues those of its input that are held."""
+    elapsed_ns = arrival.stamp_ns - held.last.stamp_ns
+    if (held.reset is None, held.is_of_clock) != (found.reset is None, found.is_of_clock):
         return False
-    if held.name == arrival.name:
-        return _reset(held, arrival) is None
-    return why.of_clock and reset.of_clock
+    if elapsed_ns <= -CLOCK_STEP_NS or (held.reset is not None and elapsed_ns > AGREEMENT_NS):
+        return False
+    return arrival.name != ODOMETRY or not _jump(held.last.value, arrival.value, elapsed_ns)
+
+
+def _agree(held: _Held, other: _Held) -> bool:
+    """Return whether messages of two sensors belong to the same new time; the images of a pair are of one sensor."""
+    if other is held:
+        return True
+    if not (held.is_of_clock and other.is_of_clock) or (held.reset is None) != (other.reset is None):
+        return False
+    names = {held.last.name, other.last.name}
+    return names != {"left", "right"} and abs(held.last.stamp_ns - other.last.stamp_ns) <= AGREEMENT_NS
+
+
+def _apart(a: Array, b: Array) -> tuple[float, float]:
+    """Return the distance in m and the angle in rad between two poses."""
+    return math.dist(a[:3, 3], b[:3, 3]), rotation_angle(a[:3, :3].T @ b[:3, :3])
+
+
+def _is_nearer(a: Array, b: Array, pose: Array) -> bool:
+    return sum(_apart(a, pose)) < sum(_apart(b, pose))
+
+
+def _jump(before: Array, after: Array, elapsed_ns: int) -> str:
+    """Return how far odometry jumped between two messages; empty when a vehicle can move so."""
+    elapsed_s = abs(elapsed_ns) * 1e-9
+    most = max(LEAST_JUMP_M, FASTEST_M_PER_S * elapsed_s), max(LEAST_JUMP_RAD, FASTEST_RAD_PER_S * elapsed_s)
+    return _excess(_apart(before, after), most)
+
+
+def _excess(moved: tuple[float, float], most: tuple[float, float]) -> str:
+    if moved[0] > most[0]:
+        return f"the odometry jumped by {moved[0]:.0f} m"
+    return f"the odometry turned by {np.degrees(moved[1]):.0f} deg at once" if moved[1] > most[1] else ""
+
+
+class OdometryMotion:
+    """Motion of the odometry of one session: its first pose, its last second, and its highest speeds."""
+
+    _SPEEDS = np.array([1.0, 0.3])
+    """Speeds that any rover may have, m/s and rad/s."""
+    _SLACK = np.array([1.0, 0.3])
+    """Motion during a silence beyond that at the highest speeds so far, m and rad."""
+    _LONGEST_S = 60.0
+    """A longer silence explains no more motion."""
+    _MARGIN = 1.25
+
+    def __init__(self) -> None:
+        self._starts: list[Array] = []
+        self._recent: deque[tuple[int, Array]] = deque()
+        self._highest = self._SPEEDS
+
+    def add(self, stamp_ns: int, odom_T_body: Array) -> None:
+        """Add the next message, a (4, 4) pose."""
+        if not self._starts:
+            self._starts = [odom_T_body, np.eye(4)]
+        self._recent.append((stamp_ns, odom_T_body))
+        while len(self._recent) > 2 and stamp_ns - self._recent[1][0] >= CLOCK_STEP_NS:
+            self._recent.popleft()
+        if self._seconds >= 0.9:
+            moved = np.array(_apart(self._recent[0][1], odom_T_body))
+            self._highest = np.maximum(self._highest, moved / self._seconds)
+
+    def contradiction(self, elapsed_ns: int, odom_T_body: Array, after_silence: bool) -> str:
+        """Return why a pose (4, 4) does not continue the last one; empty when it does.
+
+        Without a silence a pose may move like any vehicle. During a silence it may move as fast as before; an odometry
+        that starts again is always silent, and lies at its origin, or at its first pose, afterwards.
+        """
+        last = self._recent[-1][1]
+        elapsed_s = min(abs(elapsed_ns) * 1e-9, self._LONGEST_S)
+        moved = np.array(_apart(last, odom_T_body))
+        if not after_silence or self._seconds < 0.4:
+            reason = _jump(last, odom_T_body, elapsed_ns)
+        else:
+            reason = _excess(tuple(moved), tuple(self._SLACK + self._MARGIN * self._highest * elapsed_s))
+        begins_again = not reason and self._begins_again(elapsed_s, odom_T_body, moved, after_silence)
+        return "the odometry began again at its origin" if begins_again else reason
+
+    @property
+    def _seconds(self) -> float:
+        return (self._recent[-1][0] - self._recent[0][0]) * 1e-9
+
+    def _begins_again(self, elapsed_s: float, pose: Array, moved: Array, after_silence: bool) -> bool:
+        """Return whether a pose lies at the origin or the first pose, and motion to there is not what was expected."""
+        usual = 0.03 if after_silence else 2 * self._highest * elapsed_s + 0.28
+        if (moved <= usual).all():
+            return False
+        away = np.min([_apart(start, pose) for start in self._starts], axis=0)
+        if away[0] < 1e-3 and away[1] < 0.3:  # roll and pitch may be those of the ground
+            return True
+        if not after_silence or self._seconds < 0.4:
+            return False
+        last, rate = self._recent[-1][1], (self._recent[-1][1] - self._recent[0][1])[:3, 3] / self._seconds
+        expected = last.copy()
+        expected[:3, 3] += rate * min(elapsed_s, 2.0)
+        wide = (0.1, 0.2) + self._highest * min(elapsed_s, 10.0) / 2
+        near = (0.05, 0.1) + self._highest * min(elapsed_s, 2.0) / 2
+        return bool((away < near).all() and (np.array(_apart(expected, pose)) > wide).any())
 
 
 class OdometryTaker(Protocol):
@@ -163,12 +316,6 @@ class OdometryTaker(Protocol):
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> bool:
         """Take one message; return whether it was usable."""
-
-
-MAX_INTERRUPTION_NS = 60_000_000_000
-"""Longest interruption that odometry may continue its session after (*by hand*)."""
-SLACK_M = 2.0
-"""Motion during an interruption beyond that at the latest speed (*by hand*)."""
 
 
 class OdometrySessionSplitter:
@@ -184,50 +331,29 @@ class OdometrySessionSplitter:
         self.dropped = 0
         self._graph = graph
         self._clock = SessionClock()
-        self._recent: deque[tuple[int, Array]] = deque(maxlen=50)
-        self._interrupted = False
 
     @property
     def held(self) -> int:
-        """Number of messages that are wrong or begin a session, as the next message decides."""
+        """Number of messages that are wrong or begin a session, as later messages decide."""
         return self._clock.held
-
-    def interrupted(self) -> None:
-        """Note an interruption: the next message need not continue from the last one."""
-        self._interrupted = True
 
     def take(self, stamp_ns: int, odom_T_body: Array) -> Reset | None:
         """Take one message, (4, 4); return the reset of a session that begins with it, else None."""
-        restart = self._restart(stamp_ns, odom_T_body) if self._interrupted else None
-        self._interrupted = False
-        if restart is not None:
-            self._clock, self.newest_ns = SessionClock(), -1
-            self._recent.clear()
-            self._graph.begin_session()
-        self._recent.append((stamp_ns, odom_T_body))
         reset, messages = self._clock.take(StampedInput(ODOMETRY, stamp_ns, odom_T_body))
         if reset is not None:
             self._graph.begin_session()
             self.newest_ns = -1
+        self._add(messages)
+        return reset
+
+    def finish(self) -> None:
+        """Decide about the messages that are still held, at the end of the stream."""
+        self._add(self._clock.finish())
+
+    def _add(self, messages: list[StampedInput]) -> None:
         for one in messages:
             if one.fault in DROPPED:
                 self.dropped += 1
                 continue
             self._graph.add_odometry(one.stamp_ns, one.value)  # late ones too: the graph sorts them in
             self.newest_ns = max(self.newest_ns, one.stamp_ns)
-        return reset or restart
-
-    def _restart(self, stamp_ns: int, odom_T_body: Array) -> Reset | None:
-        """Return the reset after an interruption; None when the odometry continues, or there was none before."""
-        if not self._recent:
-            return None
-        (first_ns, first), (last_ns, last) = self._recent[0], self._recent[-1]
-        elapsed_s = (stamp_ns - last_ns) * 1e-9
-        if not 0 <= elapsed_s <= MAX_INTERRUPTION_NS * 1e-9:
-            return Reset("the odometry before the restart is from another time", of_clock=elapsed_s < 0)
-        speed = float(np.linalg.norm(last[:3, 3] - first[:3, 3])) / max((last_ns - first_ns) * 1e-9, 1.0)
-        moved_m = float(np.linalg.norm(odom_T_body[:3, 3] - last[:3, 3]))
-        at_origin = np.allclose(odom_T_body, np.eye(4), atol=1e-3) and not np.allclose(last, np.eye(4), atol=1e-3)
-        if at_origin or moved_m > SLACK_M + 2 * speed * elapsed_s:
-            return Reset("the odometry was reset during the interruption", of_clock=False)
-        return None

@@ -164,6 +164,9 @@ class Synchronizer:
         if reset is not None:
             self._end_session(reset.of_clock)
             self.session = self._clock.session
+        self._add_decided(messages)
+
+    def _add_decided(self, messages: list[StampedInput]) -> None:
         for one in messages:
             if one.fault:
                 self.reject(one.name, one.fault)
@@ -188,8 +191,7 @@ class Synchronizer:
 
     def flush(self) -> list[Frame]:
         """Complete the waiting frames with the data at hand, at the end of the stream, and pop them."""
-        for one in self._clock.drop_held():
-            self.reject(one.name, one.fault)
+        self._add_decided(self._clock.finish())
         self._end_session()
         return self.pop()
 

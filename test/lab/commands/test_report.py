@@ -263,7 +263,10 @@ def test_names_with_brackets_are_kept(bag: Path, tmp_path: Path) -> None:
 def test_another_recording_changes_nothing(run: Path, bag: Path, tmp_path: Path) -> None:
     report(run, bag)
     before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
-    late = write_mcap(tmp_path / "late.mcap", [(topic, at + 10**12, message) for topic, at, message in traverse(0.5)])
+    later = traverse(0.5)
+    for _, _, message in later:
+        message.header.stamp.sec += 1000
+    late = write_mcap(tmp_path / "late.mcap", [(topic, at + 10**12, message) for topic, at, message in later])
     line = only_line(umf("report", run, late))
     assert line.startswith(f"{run} was made on another recording than {late}: 18 of 18 keyframes are outside its time")
     assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
@@ -274,6 +277,15 @@ def test_a_run_knows_its_recording_from_one_of_the_same_time(run: Path, bag: Pat
     other = write_mcap(tmp_path / "other.mcap", [entry for entry in traverse(4.0) if entry[0] != LEFT])
     assert only_line(umf("report", run, other)) == (f"{run} was made on another recording, {bag}; nothing was written")
     report(run, bag)
+
+
+@pytest.mark.parametrize("later_s", [365 * 86400, 37, -(START_NS // 10**9) + 100])
+def test_a_recording_whose_times_of_recording_are_of_another_clock_is_judged(
+    run: Path, tmp_path: Path, later_s: int
+) -> None:
+    """Recorded again a year later, stamped in TAI, or by a computer without a clock."""
+    entries = [(topic, at + later_s * 10**9, message) for topic, at, message in traverse(4.0)]
+    report(run, write_mcap(tmp_path / "again.mcap", entries))
 
 
 def test_a_truth_of_another_clock_does_not_unjudge_a_run(run: Path, bag: Path, tmp_path: Path) -> None:
