@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from mcap.writer import Writer as McapWriter
 from recordings import (
     CLOUD,
     LEFT,
@@ -13,6 +17,7 @@ from recordings import (
     START_NS,
     STORE,
     TRUTH,
+    Entry,
     camera_info,
     image,
     traverse,
@@ -21,6 +26,7 @@ from recordings import (
     write_ros1,
 )
 from rosbags.typesys import Stores, get_typestore
+from zstandard import ZstdCompressor
 
 from umf_ros.bags.presets import detect_dataset, settings_for
 from umf_ros.bags.reader import open_bag
@@ -53,7 +59,103 @@ def write_db3_without_metadata(path: Path) -> Path:
     return path
 
 
+def raw_mcap(path: Path, entries: list[Entry], packed: bool = False, **options: Any) -> Path:
+    """An mcap of another writer; `packed`: each message is a zstd frame, as `--compression-mode message` makes it."""
+    with path.open("wb") as file:
+        writer = McapWriter(file, **options)
+        writer.start("other")
+        channels: dict[str, int] = {}
+        for topic, log_ns, message in entries:
+            kind = message.__msgtype__
+            if topic not in channels:
+                text = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
+                channels[topic] = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
+            data = bytes(STORE.serialize_cdr(message, kind))
+            writer.add_message(channels[topic], log_ns, ZstdCompressor().compress(data) if packed else data, log_ns)
+        writer.finish()
+    return path
+
+
+def packed_file(folder: Path) -> Path:
+    """A folder as `--compression-mode file` leaves it, without metadata."""
+    folder.mkdir()
+    plain = write_mcap(folder / "a.mcap", ENTRIES)
+    (folder / "a.mcap.zstd").write_bytes(ZstdCompressor().compress(plain.read_bytes()))
+    plain.unlink()
+    return folder
+
+
+def packed_db3(folder: Path) -> Path:
+    file = write_db3_file(folder)
+    (folder / "metadata.yaml").unlink()
+    with closing(sqlite3.connect(file)) as connection, connection:
+        rows = connection.execute("SELECT id, data FROM messages").fetchall()
+        packed = [(ZstdCompressor().compress(data), number) for number, data in rows]
+        connection.executemany("UPDATE messages SET data = ? WHERE id = ?", packed)
+    return folder
+
+
+def parallel(folder: Path, of_topic: Callable[[str], str]) -> Path:
+    """One recorder for each sensor, split in the middle."""
+    half = len(ENTRIES) // 2
+    for number, part in enumerate((ENTRIES[:half], ENTRIES[half:])):
+        for name in {of_topic(topic) for topic, _, _ in part}:
+            path = folder / f"{name}_{number}.mcap"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_mcap(path, [entry for entry in part if of_topic(entry[0]) == name])
+    return folder
+
+
+def with_metadata(folder: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
+    path = write_db3(folder, ENTRIES) / "metadata.yaml"
+    known = yaml.safe_load(path.read_text())
+    change(known["rosbag2_bagfile_information"])
+    path.write_text(yaml.safe_dump(known))
+    return folder
+
+
+def forget_counts(known: dict[str, Any]) -> None:
+    known["message_count"] = known["duration"]["nanoseconds"] = 0
+    known["topics_with_message_count"] = []
+
+
+def second_half_unlisted(folder: Path) -> Path:
+    """Two db3 files of which the metadata list the first only."""
+    half = len(ENTRIES) // 2
+    with_metadata(folder, lambda known: known)
+    for path in folder.glob("*.db3"):
+        path.unlink()
+    for number, part in enumerate((ENTRIES[:half], ENTRIES[half:])):
+        write_db3_part(folder.parent / f"part_{number}", part).rename(folder / f"b_{number}.db3")
+    return folder
+
+
+def write_db3_part(folder: Path, entries: list[Entry]) -> Path:
+    (file,) = write_db3(folder, entries).glob("*.db3")
+    return file
+
+
+BY_TOPIC = sorted(ENTRIES, key=lambda entry: entry[0])
+BARE = {"use_chunking": False, "use_statistics": False, "use_summary_offsets": False}
 FORMATS: dict[str, Callable[[Path], Path]] = {
+    "mcap with packed messages": lambda folder: raw_mcap(folder / "a.mcap", ENTRIES, True),
+    "mcap packed as a whole": lambda folder: next(packed_file(folder / "b").iterdir()),
+    "folder of an mcap packed as a whole": lambda folder: packed_file(folder / "b"),
+    "db3 with packed messages": lambda folder: packed_db3(folder / "b"),
+    "parallel recorders": lambda folder: parallel(folder / "b", lambda topic: topic.split("/")[1]),
+    "parallel recorders in folders": lambda folder: parallel(folder / "b", lambda topic: f"{topic.split('/')[1]}/x"),
+    "metadata without counts": lambda folder: with_metadata(folder / "b", forget_counts),
+    "metadata without storage": lambda folder: with_metadata(
+        folder / "b", lambda known: known.update(storage_identifier="")
+    ),
+    "metadata of the first file": lambda folder: second_half_unlisted(folder / "b"),
+    "mcap without chunks": lambda folder: raw_mcap(folder / "a.mcap", ENTRIES, use_chunking=False),
+    "mcap without chunks by topic": lambda folder: raw_mcap(folder / "a.mcap", BY_TOPIC, use_chunking=False),
+    "mcap without a summary": lambda folder: raw_mcap(folder / "a.mcap", ENTRIES, **BARE),
+    "mcap without channels in its summary": lambda folder: raw_mcap(
+        folder / "a.mcap", ENTRIES, repeat_channels=False, repeat_schemas=False
+    ),
+    "mcap without statistics": lambda folder: raw_mcap(folder / "a.mcap", ENTRIES, use_statistics=False),
     "mcap": lambda folder: write_mcap(folder / "a.mcap", ENTRIES),
     "mcap folder": lambda folder: write_mcap_folder(folder / "run"),
     "db3 folder": lambda folder: write_db3(folder / "b", ENTRIES),
@@ -67,8 +169,11 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
 def test_every_format_gives_the_same_messages_in_the_same_order(form: str, tmp_path: Path) -> None:
     bag = open_bag(FORMATS[form](tmp_path))
     read = list(bag.messages())
-    assert [(topic, log_ns) for topic, log_ns, _ in read] == [(topic, log_ns) for topic, log_ns, _ in ENTRIES]
-    for (topic, _, got), (_, _, put) in zip(read, ENTRIES, strict=True):
+    assert [log_ns for _, log_ns, _ in read] == [log_ns for _, log_ns, _ in ENTRIES]
+    # messages of one time in different files have no order
+    read, written = (sorted(entries, key=lambda entry: (entry[1], entry[0])) for entries in (read, ENTRIES))
+    assert [topic for topic, _, _ in read] == [topic for topic, _, _ in written]
+    for (topic, _, got), (_, _, put) in zip(read, written, strict=True):
         if topic == LEFT:
             assert (decode_image(got) == decode_image(put)).all()
         elif topic == CLOUD:
@@ -83,6 +188,22 @@ def test_every_format_gives_the_same_messages_in_the_same_order(form: str, tmp_p
     assert (bag.start_ns, bag.end_ns) == (ENTRIES[0][1], ENTRIES[-1][1])
     assert bag.duration_s == pytest.approx((ENTRIES[-1][1] - ENTRIES[0][1]) / 1e9)
     assert bag.warning == ""
+
+
+def test_files_of_one_recorder_whose_clock_was_set_back_stay_in_their_order(tmp_path: Path) -> None:
+    long = traverse(3.0)
+    for number in (0, 1):
+        write_mcap(tmp_path / f"a_{number}.mcap", long)
+    assert [log_ns for _, log_ns, _ in open_bag(tmp_path).messages()] == 2 * [log_ns for _, log_ns, _ in long]
+
+
+def test_folders_of_different_times_are_not_one_recording(tmp_path: Path) -> None:
+    half = len(ENTRIES) // 2
+    for name, part in (("monday", ENTRIES[:half]), ("tuesday", ENTRIES[half:])):
+        (tmp_path / name).mkdir()
+        write_mcap(tmp_path / name / "a.mcap", part)
+    with pytest.raises(BagError, match=r"holds 2 recordings of different times, name one: .*monday, .*tuesday"):
+        open_bag(tmp_path)
 
 
 @pytest.mark.parametrize("form", ["mcap", "db3 folder", "ROS 1"])

@@ -24,7 +24,7 @@ from umf_ros.sensors.decode import TYPES, OdometrySample, stamp_ns
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
 from umf_ros.sensors.sessions import ODOMETRY, Input
 from umf_ros.sensors.synchronizer import InputCounter, Synchronizer
-from umf_ros.sensors.tf import TOPIC, BodyFrames, StaticTransforms
+from umf_ros.sensors.tf import MOVING_TOPIC, BodyFrames, StaticTransforms, constant_transforms, transform_topics
 
 _log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ class FrameReader:
         self._synchronizer = Synchronizer(settings.sync, calibration, inputs, warn)
         self._samples: list[OdometrySample | AbsoluteMeasurement] = []
         self._truth: list[RawMessage] = []
-        transforms = read_transforms(bag) if settings.uses_transforms else StaticTransforms()
+        transforms = read_transforms(bag, calibration.is_open) if settings.uses_transforms else StaticTransforms()
         known = transforms.version or calibration.is_open
         frames = BodyFrames(settings.frames, transforms, warn, 0.0, calibration) if known else None
         self._router = MessageRouter(self._synchronizer, topics, warn, self._samples.append, frames)
@@ -123,13 +123,17 @@ class FrameReader:
             self._rows_taken = max(self._rows_taken, end)
 
 
-def read_transforms(bag: Bag) -> StaticTransforms:
-    """Return the static transforms of a recording, published at any time, as they are latched."""
+def read_transforms(bag: Bag, also_repeated: bool = False) -> StaticTransforms:
+    """Return the static transforms of a recording, published at any time, as they are latched, in any namespace.
+
+    Where there are none, those on `/tf` that never change can be taken.
+    """
     transforms = StaticTransforms()
-    if TOPIC in bag.topics:
-        for _, _, message in bag.messages([TOPIC]):
-            transforms.add(message)
-    return transforms
+    for _, _, message in bag.messages(transform_topics(bag.types)):
+        transforms.add(message)
+    if transforms.version or not also_repeated:
+        return transforms
+    return constant_transforms(message for _, _, message in bag.messages(transform_topics(bag.types, MOVING_TOPIC)))
 
 
 def _absolute_topics(settings: Settings, bag: Bag) -> dict[str, Aid]:

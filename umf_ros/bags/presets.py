@@ -11,6 +11,7 @@ from umf_ros.bags.reader import Bag, decode
 from umf_ros.core.config import Settings, load_preset, load_settings
 from umf_ros.core.errors import BagError, MessageError
 from umf_ros.sensors.calibration import load_calibration
+from umf_ros.sensors.tf import MOVING_TOPIC, transform_topics
 from umf_ros.sensors.tf import TOPIC as TRANSFORMS_TOPIC
 from umf_ros.sensors.topic_finder import known_dataset, must_find, with_topics
 
@@ -71,7 +72,8 @@ def settings_for(bag: Bag, config: Path | None, dataset: str, **overrides: Any) 
     try:
         found = detect_dataset(bag, own_calibration=bool(settings.calibration))
     except BagError as error:
-        if not settings.calibration and TRANSFORMS_TOPIC not in bag.topics:
+        has_transforms = transform_topics(bag.types) or transform_topics(bag.types, MOVING_TOPIC)
+        if not settings.calibration and not has_transforms:
             advice = f"the parameter calibration names a file, and umf inspect {bag.path} --write . writes a first one"
             text = f"{error}, and without {TRANSFORMS_TOPIC} its sensors are anywhere; {advice}"
             raise BagError(text) from None

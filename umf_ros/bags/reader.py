@@ -8,12 +8,12 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import lz4.frame
 from mcap.data_stream import ReadDataStream
@@ -26,7 +26,7 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
-from zstandard import ZstdError, frame_content_size
+from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 from umf_ros.core.errors import BagError, MessageError, check_utf8, one_line, reading
 from umf_ros.sensors.decode import LIVOX, stamp_ns
@@ -84,15 +84,20 @@ def message_types() -> Typestore:
 
 
 _DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}
+_ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 def unpack(compression: str, data: bytes) -> bytes:
-    """Return the contents of a chunk compressed as "bz2" or "lz4".
+    """Return the contents of a chunk or a message compressed as "bz2", "lz4" or "zstd".
 
     Raises:
         ValueError: they are larger than `LARGEST_CHUNK`.
     """
-    unpacked = _DECOMPRESSORS[compression]().decompress(data, LARGEST_CHUNK + 1)
+    if compression == "zstd":
+        with ZstdDecompressor().stream_reader(data) as stream:
+            unpacked = stream.read(LARGEST_CHUNK + 1)
+    else:
+        unpacked = _DECOMPRESSORS[compression]().decompress(data, LARGEST_CHUNK + 1)
     if len(unpacked) > LARGEST_CHUNK:
         raise ValueError(f"a chunk holds more than {LARGEST_CHUNK} bytes")
     return unpacked
@@ -113,10 +118,15 @@ PlacedMessage = tuple[int, tuple[int, int], RawMessage]
 
 
 class McapFile:
-    """An mcap file, read by its index; without one, as a killed recorder leaves it, up to its truncation."""
+    """An mcap file, read by its index; without one, as a killed recorder leaves it, up to its truncation.
+
+    A file that is compressed as a whole (`.mcap.zstd`) has no use of its index. Without an index, a file whose messages
+    are not in the order of time is read once for each topic.
+    """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._fault, self.warning = path, "", ""
+        self.path, self._fault, self.warning = path, "", ""
+        self._is_packed, self._is_sorted = path.suffix in (".zstd", ".zst"), True
         self._chunks: list[ChunkIndex] = []
         self.types: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
@@ -127,18 +137,28 @@ class McapFile:
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield messages of some topics in the order of their recording."""
-        return _in_order(self._by_index(topics) if self._chunks else self._read_sequentially(topics))
+        if self._chunks:
+            return _in_order(self._by_index(topics))
+        passes = [topics] if self._is_sorted else [{topic} for topic in topics & self.types.keys()]
+        return heapq.merge(*(_in_order(self._read_sequentially(one)) for one in passes), key=lambda one: one.log_ns)
+
+    @contextmanager
+    def _open(self) -> Iterator[IO[bytes]]:
+        with self.path.open("rb") as stream:
+            yield ZstdDecompressor().stream_reader(stream) if self._is_packed else stream
 
     def _read_index(self) -> None:
-        with self._path.open("rb") as stream:
+        with self.path.open("rb") as stream:
             summary = make_reader(stream).get_summary()
-        if summary is None or summary.statistics is None or not summary.chunk_indexes:
+        if summary is None or summary.statistics is None or not summary.chunk_indexes or not summary.channels:
             raise ValueError("no index")
+        if sum(summary.statistics.channel_message_counts.values()) != summary.statistics.message_count:
+            raise ValueError("no counts")
         channels = {key: channel for key, channel in summary.channels.items() if channel.message_encoding == "cdr"}
         if summary.channels and not channels:
             encodings = ", ".join(sorted({channel.message_encoding for channel in summary.channels.values()}))
-            raise BagError(f"{self._path} holds messages encoded as {encodings}; only those of ROS 2 (cdr) can be read")
-        _check_chunks(self._path, summary.chunk_indexes)
+            raise BagError(f"{self.path} holds messages encoded as {encodings}; only those of ROS 2 (cdr) can be read")
+        _check_chunks(self.path, summary.chunk_indexes)
         self._channels = {
             key: (channel.topic, summary.schemas[channel.schema_id].name) for key, channel in channels.items()
         }
@@ -154,15 +174,16 @@ class McapFile:
         for message in self._stream():
             self.types[message.topic] = message.type
             self.counts[message.topic] += 1
+            self._is_sorted &= message.log_ns >= self.end_ns - SORTING_WINDOW_NS
             self.start_ns = min(self.start_ns, message.log_ns)
             self.end_ns = max(self.end_ns, message.log_ns)
         if self._fault:
             seconds, count = max(0, self.end_ns - self.start_ns) * 1e-9, self.counts.total()
-            self.warning = f"{self._path} is truncated; its first {seconds:.1f} s ({count} messages) are readable"
+            self.warning = f"{self.path} is truncated; its first {seconds:.1f} s ({count} messages) are readable"
 
     def _by_index(self, topics: Collection[str]) -> Iterator[PlacedMessage]:
         wanted = {key: channel for key, channel in self._channels.items() if channel[0] in topics}
-        with self._path.open("rb") as stream:
+        with self.path.open("rb") as stream:
             for index in self._chunks:
                 if index.message_index_offsets and not wanted.keys() & index.message_index_offsets.keys():
                     continue
@@ -170,7 +191,7 @@ class McapFile:
                 for number, record in enumerate(_unpacked(Chunk.read(ReadDataStream(stream)))):
                     if isinstance(record, Message) and record.channel_id in wanted:
                         topic, kind = wanted[record.channel_id]
-                        message = RawMessage(topic, record.log_time, kind, record.data)
+                        message = _message(topic, record.log_time, kind, record.data)
                         yield index.message_start_time, (index.chunk_start_offset, number), message
 
     def _read_sequentially(self, topics: Collection[str]) -> Iterator[PlacedMessage]:
@@ -182,9 +203,9 @@ class McapFile:
         """Yield the messages in the order of the file."""
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
-        with self._path.open("rb") as stream:
+        with self._open() as stream:
             try:
-                limit = min(self._path.stat().st_size, LARGEST_CHUNK)
+                limit = LARGEST_CHUNK if self._is_packed else min(self.path.stat().st_size, LARGEST_CHUNK)
                 records = StreamReader(stream, emit_chunks=True, record_size_limit=limit).records
                 for record in chain.from_iterable(
                     _unpacked(one) if isinstance(one, Chunk) else [one] for one in records
@@ -197,7 +218,7 @@ class McapFile:
                         channel = channels.get(record.channel_id)
                         if channel and channel.message_encoding == "cdr" and channel.schema_id in schemas:
                             type_name = schemas[channel.schema_id].name
-                            yield RawMessage(channel.topic, record.log_time, type_name, record.data)
+                            yield _message(channel.topic, record.log_time, type_name, record.data)
             except _DAMAGE as error:
                 self._fault = str(error) or type(error).__name__
 
@@ -215,6 +236,11 @@ def _in_order(messages: Iterable[PlacedMessage]) -> Iterator[RawMessage]:
             yield first
     while waiting:
         yield heapq.heappop(waiting)[2]
+
+
+def _message(topic: str, log_ns: int, kind: str, data: bytes) -> RawMessage:
+    """Return a message whose data may be compressed on their own, as rosbag2 does on request; CDR begins otherwise."""
+    return RawMessage(topic, log_ns, kind, unpack("zstd", data) if data[:4] == _ZSTD else data)
 
 
 def _unpacked(chunk: Chunk) -> Iterable[McapRecord]:
@@ -258,7 +284,7 @@ class RosbagsFile:
     """
 
     def __init__(self, path: Path, ros1: bool = False) -> None:
-        self._path = path
+        self.path = path
         self._reader: Any = Reader1 if ros1 else Reader2
         self._to_cdr = message_types().ros1_to_cdr if ros1 else None
         self.warning = _warning_of_log(path)
@@ -272,14 +298,14 @@ class RosbagsFile:
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield messages of some topics in the order of their recording."""
-        with self._reader(self._path) as reader:
+        with self._reader(self.path) as reader:
             wanted = [connection for connection in self._readable(reader) if connection.topic in topics]
             for place, chunk in getattr(reader, "chunks", {}).items():  # of ROS 1
                 limited = _LIMITED.get(chunk.decompressor, chunk.decompressor)
                 reader.chunks[place] = chunk._replace(decompressor=limited)
             for connection, log_ns, data in reader.messages(wanted) if wanted else ():
                 cdr = bytes(self._to_cdr(data, connection.msgtype)) if self._to_cdr else data
-                yield RawMessage(connection.topic, log_ns, connection.msgtype, cdr)
+                yield _message(connection.topic, log_ns, connection.msgtype, cdr)
 
     def _readable(self, reader: Any) -> list[Connection]:
         known = message_types().fielddefs
@@ -315,7 +341,7 @@ def open_files(path: Path) -> list[RecordedFile]:
         start = file.read(16)
     if not start:
         raise BagError(f"{path} is empty")
-    if start.startswith(_MCAP):
+    if start.startswith(_MCAP) or (start.startswith(_ZSTD) and ".mcap" in path.suffixes):
         return [McapFile(path)]
     if start.startswith((_SQLITE, _ROS1)):
         return [RosbagsFile(path, ros1=start.startswith(_ROS1))]
@@ -323,14 +349,49 @@ def open_files(path: Path) -> list[RecordedFile]:
 
 
 def _open_folder(path: Path) -> list[RecordedFile]:
-    mcap, db3 = (_in_number_order(one for one in path.glob(f"*.{kind}") if one.is_file()) for kind in ("mcap", "db3"))
-    if mcap:
-        return [McapFile(one) for one in mcap]
-    if (path / "metadata.yaml").is_file():
+    """Open all files of a folder, or those of folders in it, whatever its metadata list: recorders are killed."""
+    inside = [file for one in sorted(path.iterdir()) if one.is_dir() for file in _files_of(one)]
+    paths = _in_number_order(_files_of(path) or inside)
+    if not paths and (path / "metadata.yaml").is_file():  # db3 files that are compressed as a whole
         return [RosbagsFile(path)]
-    if db3:  # the recorder was killed before it wrote its metadata
-        return [RosbagsFile(one) for one in db3]
-    raise BagError(f"{path} is not a recording: it holds neither metadata.yaml nor mcap or db3 files")
+    if not paths:
+        raise BagError(f"{path} is not a recording: it holds neither metadata.yaml nor mcap or db3 files")
+    files = [RosbagsFile(one) if one.suffix == ".db3" else McapFile(one) for one in paths]
+    folders = dict.fromkeys(file.path.parent for file in files)
+    if len(folders) > 1 and all(len({file.path.parent for file in group}) == 1 for group in _overlapping(files)):
+        names = ", ".join(str(one) for one in folders)
+        raise BagError(f"{path} holds {len(folders)} recordings of different times, name one: {names}")
+    return files
+
+
+def _files_of(folder: Path) -> list[Path]:
+    found = [one for kind in ("mcap", "db3", "mcap.zst*") for one in folder.glob(f"*.{kind}") if one.is_file()]
+    plain = {one.name for one in found}
+    return [one for one in found if one.name.removesuffix(one.suffix) not in plain]  # unpacked beside
+
+
+def _overlapping(files: Iterable[RecordedFile]) -> list[list[RecordedFile]]:
+    """Return the files in groups that were written at the same time, by one recorder for each sensor.
+
+    Files of the same topics at the same time are not of parallel recorders: their clock was set back.
+    """
+    filled = [file for file in files if file.counts.total()]
+    groups: list[list[RecordedFile]] = []
+    for file in sorted(filled, key=lambda one: one.start_ns):
+        together = [one for one in groups[-1] if file.start_ns < one.end_ns] if groups else []
+        if any(
+            one.counts.keys() == file.counts.keys() for one in together if _common_ns(one, file) > SORTING_WINDOW_NS
+        ):
+            return [[one] for one in filled]
+        if together:
+            groups[-1].append(file)
+        else:
+            groups.append([file])
+    return sorted(groups, key=lambda group: min(map(filled.index, group)))
+
+
+def _common_ns(a: RecordedFile, b: RecordedFile) -> int:
+    return min(a.end_ns, b.end_ns) - max(a.start_ns, b.start_ns)
 
 
 def _in_number_order(paths: Iterable[Path]) -> list[Path]:
@@ -383,8 +444,8 @@ class Bag:
         """
         wanted = self.topics.keys() if topics is None else self.topics.keys() & set(topics)
         with reading(self.path, BagError, "cannot be read"):
-            for file in self._files:
-                yield from file.messages(wanted)
+            for group in _overlapping(self._files):
+                yield from heapq.merge(*(file.messages(wanted) for file in group), key=lambda one: one.log_ns)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, Any]]:
         """Yield topic, time of recording in ns and message, in the order of their recording.

@@ -15,9 +15,9 @@ from umf_ros.sensors.decode import (
     decode_camera_info,
     decode_cloud,
     decode_image,
-    decode_odometry,
     stamp_ns,
 )
+from umf_ros.sensors.odometry import OdometryDecoder
 from umf_ros.sensors.sessions import ODOMETRY, Input
 from umf_ros.sensors.synchronizer import SILENCE_NS, Synchronizer
 from umf_ros.sensors.tf import BodyFrames
@@ -54,6 +54,7 @@ class MessageRouter:
     ) -> None:
         """Pass every sample to `on_odometry`; without `frames` sensors are as calibrated, odometry is the body's."""
         self._frames = frames
+        self._read_odometry = frames.odometry if frames is not None else OdometryDecoder(warn).decode
         self._synchronizer = synchronizer
         self._on_odometry = on_odometry
         self._warn = warn
@@ -78,8 +79,7 @@ class MessageRouter:
 
     def _take(self, entry: str, message: Any) -> None:
         if entry == ODOMETRY:
-            read = self._frames.odometry if self._frames is not None else decode_odometry
-            self.take_odometry(read(message))
+            self.take_odometry(self._read_odometry(message))
         elif entry in ("left_info", "right_info"):
             self._use_info(entry, message)
         else:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,19 @@ from umf_ros.core.config import FrameIds
 from umf_ros.core.errors import MessageError
 from umf_ros.core.geometry import Array, from_quaternion, invert
 from umf_ros.sensors.calibration import Calibration
-from umf_ros.sensors.decode import OdometrySample, decode_odometry
+from umf_ros.sensors.decode import OdometrySample
+from umf_ros.sensors.odometry import OdometryDecoder
 
-TOPIC = "/tf_static"
+TOPIC, MOVING_TOPIC = "/tf_static", "/tf"
+TYPE = "tf2_msgs/msg/TFMessage"
 _UP = 0.9
 PATIENCE_S = 3.0
 """Time within which latched messages arrive after the start of a node."""
+
+
+def transform_topics(types: Mapping[str, str], name: str = TOPIC) -> list[str]:
+    """Return the topics of transforms with this name, in any namespace, out of topics and their types."""
+    return [topic for topic, kind in types.items() if kind == TYPE and topic.endswith(name)]
 
 
 class StaticTransforms:
@@ -40,6 +48,11 @@ class StaticTransforms:
                 self._parents[child] = parent, pose
                 self.version += 1
 
+    def forget(self, frames: Collection[str]) -> None:
+        """Delete the transforms of some frames to their parents."""
+        self._parents = {child: known for child, known in self._parents.items() if child not in frames}
+        self.version = len(self._parents)
+
     def find(self, frame: str, other: str) -> Array | None:
         """Return (4, 4) `frame_T_other`, or None where no chain of static transforms connects the two."""
         frame_roots, other_roots = self._to_roots(frame.lstrip("/")), self._to_roots(other.lstrip("/"))
@@ -57,6 +70,19 @@ class StaticTransforms:
             poses[parent] = pose @ poses[name]
             name = parent
         return poses
+
+
+def constant_transforms(messages: Iterable[Any]) -> StaticTransforms:
+    """Return the transforms that never change in all `/tf` messages of a recording, as tf1's publishers repeat them."""
+    found, seen, moving = StaticTransforms(), set[str](), set[str]()
+    for stamped in (one for message in messages for one in message.transforms):
+        version, child = found.version, stamped.child_frame_id.lstrip("/")
+        found.add(SimpleNamespace(transforms=[stamped]))
+        if found.version != version and child in seen:
+            moving.add(child)
+        seen.add(child)
+    found.forget(moving)
+    return found
 
 
 class BodyFrames:
@@ -77,6 +103,7 @@ class BodyFrames:
     ) -> None:
         """Without a calibration, `mounting` returns no poses."""
         self._base, self._transforms, self._warn = frames.base, transforms, warn
+        self._decoder = OdometryDecoder(warn)
         self._calibration = calibration
         self._mounted: dict[str, tuple[str, int]] = {}
         self._poses: dict[str, Array] = {}
@@ -141,17 +168,17 @@ class BodyFrames:
 
         Raises:
             MessageError: of kind "frame": another source than the first message's; of kind "transforms": not yet known;
-                or as `decode_odometry`.
+                or as `OdometryDecoder.decode`.
         """
-        sample = decode_odometry(message)
         names = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
+        if self._names is not None and names != self._names:
+            before, now = (" to ".join(map(repr, pair)) for pair in (self._names, names))
+            raise MessageError("frame", f"odometry from {now}, after that from {before}: two sources on one topic?")
+        sample = self._decoder.decode(message)
         if self._names is None:
             self._names = names
             self.odom = names[0] or self.odom
             self._first_ns = sample.stamp_ns
-        if names != self._names:
-            before, now = (" to ".join(map(repr, pair)) for pair in (self._names, names))
-            raise MessageError("frame", f"odometry from {now}, after that from {before}: two sources on one topic?")
         if self._part_T_body is None:
             self._part_T_body = self._look_up(names[1], sample.stamp_ns - self._first_ns)
         if self._part_T_body is None:

@@ -90,7 +90,10 @@ def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> 
     with writing(f"to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
     known = calibration_of_dataset(found, recording)
-    text = write_calibration(found, read_transforms(recording)) if known is None else known.read_text(encoding="utf-8")
+    if known is None:
+        text = write_calibration(found, read_transforms(recording, also_repeated=True))
+    else:
+        text = known.read_text(encoding="utf-8")
     write_atomically(calibration, text)
     write_atomically(settings, write_settings(found, str(calibration.resolve())))
     guesses = text.count(GUESS)

@@ -1,0 +1,104 @@
+"""Decode odometry messages, also those whose pose a driver never fills."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from umf_ros.core.errors import MessageError
+from umf_ros.core.geometry import Array, expmap, make_pose
+from umf_ros.sensors.decode import OdometrySample, decode_pose, stamp_ns
+
+MOVED = np.array([0.25, 0.1])
+"""Motion by the twist, m and rad, after which a position or an orientation that is still the first one to the bit was
+never filled (*by hand*: above the resolution of any odometry)."""
+LONGEST_STEP_S = 1.0
+CHORD_M = 1.0
+TURNED_RAD = 0.8
+"""Change of direction of a path of chords beyond which an orientation must have changed (*by hand*)."""
+
+
+class OdometryDecoder:
+    """Decoder of nav_msgs/Odometry of one source.
+
+    The twist is integrated in place of a position or an orientation that is never filled. Messages with positions, but
+    with neither an orientation nor a twist, are refused once the path has turned.
+    """
+
+    def __init__(self, warn: Callable[[str], None]) -> None:
+        self._warn = warn
+        self._first: tuple[Array, Array] | None = None
+        self._last_ns = 0
+        # of position and orientation
+        self._is_filled, self._is_missing, self._moved = np.zeros(2, bool), np.zeros(2, bool), np.zeros(2)
+        self._start: Array = np.eye(4)
+        self._integrated: Array = np.eye(4)
+        self._turn: Array = np.eye(3)
+        self._corner: Array | None = None
+        self._direction: Array | None = None
+
+    def decode(self, message: Any) -> OdometrySample:
+        """Return the pose of a message.
+
+        Raises:
+            MessageError: as `decode_pose`, or of kind "orientation": it is never filled.
+        """
+        stamp, pose = stamp_ns(message), message.pose.pose
+        position, turn = pose.position, pose.orientation
+        given = np.array([position.x, position.y, position.z]), np.array([turn.x, turn.y, turn.z, turn.w])
+        is_empty = not self._is_filled[1] and not given[1].any()
+        odom_T_body = make_pose(np.eye(3), given[0]) if is_empty else decode_pose(pose)
+        if self._first is None:
+            self._first, self._last_ns = given, stamp
+            self._start, self._integrated = odom_T_body, odom_T_body.copy()
+        if not self._is_filled.all():
+            self._is_filled |= [not np.array_equal(a, b) for a, b in zip(given, self._first, strict=True)]
+            odom_T_body = self._complete(message.twist.twist, stamp, odom_T_body)
+        self._last_ns = stamp
+        return OdometrySample(stamp, odom_T_body)
+
+    def _complete(self, twist: Any, stamp: int, odom_T_body: Array) -> Array:
+        """Return a pose (4, 4) with its unfilled parts integrated, once the twist says that the body has moved."""
+        speeds = np.array([[getattr(part, axis) for axis in "xyz"] for part in (twist.linear, twist.angular)])
+        elapsed_s = (stamp - self._last_ns) * 1e-9
+        steps = np.nan_to_num(speeds) * (elapsed_s if 0 < elapsed_s <= LONGEST_STEP_S else 0.0)
+        self._moved += np.linalg.norm(steps, axis=1)
+        half = expmap(np.hstack([steps[1], steps[0]])[None] / 2)[0]
+        self._integrated = self._integrated @ half @ half
+        is_new = ~self._is_filled & ~self._is_missing & (self._moved > MOVED)
+        if self._is_filled[0]:  # the first heading follows from the first motion
+            is_new[1] &= self._moved[0] > MOVED[0]
+        for part in np.array(["position", "orientation"])[is_new]:
+            self._warn(f"the {part} of the odometry is never filled: its twist is integrated")
+        if is_new[1] and self._is_filled[0]:
+            moved, expected = odom_T_body[:2, 3] - self._start[:2, 3], (self._integrated - self._start)[:2, 3]
+            angle = np.arctan2(moved[1], moved[0]) - np.arctan2(expected[1], expected[0])
+            self._turn = Rotation.from_euler("z", angle).as_matrix()
+        self._is_missing |= is_new
+        if self._is_missing[1]:
+            odom_T_body[:3, :3] = self._turn @ self._integrated[:3, :3]
+        else:
+            self._integrated[:3, :3] = odom_T_body[:3, :3] if self._is_filled[1] else self._integrated[:3, :3]
+        if self._is_missing[0]:
+            odom_T_body[:3, 3] = self._integrated[:3, 3]
+        if self._is_filled[0] and not self._is_filled[1] and not self._is_missing[1]:
+            self._check_path(odom_T_body[:3, 3])
+        return odom_T_body
+
+    def _check_path(self, position: Array) -> None:
+        """Refuse an orientation that stays the first one where the path of positions (3,) turns."""
+        if self._corner is None:
+            self._corner = position
+        chord = position - self._corner
+        if (length_m := float(np.linalg.norm(chord))) < CHORD_M:
+            return
+        direction, self._corner = chord / length_m, position
+        if self._direction is None:
+            self._direction = direction
+        if float(direction @ self._direction) < np.cos(TURNED_RAD):
+            self._corner = position - chord  # the next message is refused too
+            text = "the orientation of the odometry is never filled, while its path turns: the odometry is not used"
+            raise MessageError("orientation", text)
