@@ -16,7 +16,7 @@ def running() -> Iterator[PostgresServer]:
     """A server with the tables of a fleet and two rovers."""
     with PostgresServer() as server:
         with psycopg.connect(server.address(), password=PASSWORD, autocommit=True) as connection:
-            assert migrate(connection, *IDENTITY) == (0, 1)
+            assert migrate(connection, *IDENTITY) == (0, 2)
             for rover in ROVERS:
                 add_rover(connection, rover, f"secret of {rover}")
         yield server

@@ -11,7 +11,7 @@ from support.postgres import PASSWORD, PostgresServer, free_port
 
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Keyframe
-from umf_ros.fleet.server import MIGRATIONS, FleetServer, LinkError, add_rover, migrate
+from umf_ros.fleet.server import LARGEST_PLACE, MIGRATIONS, ROVERS, FleetServer, LinkError, add_rover, migrate
 from umf_ros.places.store import unpack
 
 STORE = uuid4()
@@ -66,6 +66,52 @@ def test_a_rover_cannot_change_rows_of_others(server: PostgresServer, statement:
     with psycopg.connect(server.address("bea")) as connection, pytest.raises(psycopg.errors.InsufficientPrivilege):
         connection.execute(statement)
     assert stored(server) == [("ada", 1)]
+
+
+def test_a_rover_writes_under_its_own_name_whatever_its_role(server: PostgresServer) -> None:
+    """Rows under the name of the role of all rovers would be those of no rover."""
+    connect(server, "ada").push([place(1)])
+    write = "INSERT INTO place SELECT current_user, gen_random_uuid(), 0, 5, 0, descriptor FROM place LIMIT 1"
+    with psycopg.connect(server.address("bea")) as connection:
+        connection.execute(f"SET ROLE {ROVERS}")
+        with pytest.raises(psycopg.errors.InsufficientPrivilege):
+            connection.execute(write)
+    assert stored(server) == [("ada", 1)]
+
+
+@pytest.mark.parametrize("number", [60000, 0])
+def test_a_descriptor_that_is_not_of_unit_length_is_refused_by_the_server(server: PostgresServer, number: int) -> None:
+    descriptor = f"[{','.join([str(number)] * IDENTITY[1])}]"
+    with psycopg.connect(server.address("bea")) as connection, pytest.raises(psycopg.errors.CheckViolation):
+        connection.execute("INSERT INTO place VALUES ('bea', gen_random_uuid(), 0, 5, 0, %s)", (descriptor,))
+
+
+def test_what_an_earlier_server_took_is_checked_by_the_reader(server: PostgresServer) -> None:
+    ada = connect(server, "ada")
+    ada.push([place(1), place(2)])
+    with administrator(server) as connection:
+        connection.execute("ALTER TABLE place DROP CONSTRAINT place_descriptor_check")
+        connection.execute("ALTER TABLE place_data DROP CONSTRAINT place_data_data_check")
+        long = f"[{','.join(['99'] * IDENTITY[1])}]"
+        connection.execute("UPDATE place SET descriptor = %s WHERE stamp_ns = 1000000000", (long,))
+        connection.execute("UPDATE place_data SET data = repeat('x', %s)::bytea", (LARGEST_PLACE + 1,))
+    bea = connect(server, "bea")
+    found = bea.nearest(place(1).embedding.descriptor, 3)
+    assert [key.stamp_ns for key, _ in found] == [2 * 10**9]
+    assert bea.data(found[0][0]) is None
+
+
+@pytest.mark.parametrize("name", ["postgres", ROVERS, "clerk", "pg_monitor"])
+def test_the_password_of_a_role_that_is_no_rover_stays(server: PostgresServer, name: str) -> None:
+    with administrator(server) as connection:
+        if name == "clerk":
+            connection.execute("CREATE ROLE clerk LOGIN CREATEROLE PASSWORD 'before'")
+            connection.execute(f"GRANT {ROVERS} TO clerk")
+        name = connection.execute("SELECT current_user").fetchone()[0] if name == "postgres" else name
+        before = connection.execute("SELECT rolpassword FROM pg_authid WHERE rolname = %s", (name,)).fetchone()
+        with pytest.raises(UmfError, match="is a role of the server that is no rover: its password was not changed"):
+            add_rover(connection, name, "mine")
+        assert connection.execute("SELECT rolpassword FROM pg_authid WHERE rolname = %s", (name,)).fetchone() == before
 
 
 def test_passwords_reach_neither_log_nor_message(server: PostgresServer, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import pytest
@@ -57,3 +58,32 @@ def test_other_folders_are_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "map.json").write_text('{"schema": 99, "sessions": []}')
     with pytest.raises(UmfError, match="another version"):
         MapFolder.open(tmp_path)
+
+
+WRONG_NAMES = ("../../../x", "/tmp/x", "a/b", "..", ".", "", "a\\b", "line\nbreak", "\x1b[2J", "x" * 300, "\u202eevil")
+
+
+@pytest.mark.parametrize("name", WRONG_NAMES)
+def test_a_session_whose_name_leads_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
+    made_map(tmp_path / "map", [MadeSession("a", 0, 30)])
+    path = tmp_path / "map" / "map.json"
+    content = json.loads(path.read_text())
+    content["sessions"][0]["name"] = name
+    path.write_text(json.dumps(content))
+    with pytest.raises(UmfError, match="is not the name of a file in") as caught:
+        MapFolder.open(tmp_path / "map")
+    assert str(caught.value).isprintable()
+
+
+def test_a_link_out_of_the_map_is_refused(tmp_path: Path) -> None:
+    folder = MapFolder.open_or_create(tmp_path / "map", load_settings(None))
+    (tmp_path / "map" / "sessions").mkdir()
+    (tmp_path / "map" / "sessions" / "a").symlink_to(tmp_path, target_is_directory=True)
+    with pytest.raises(UmfError, match="is not the name of a file in"):
+        folder.folder_of("a")
+
+
+@pytest.mark.parametrize("file", ["...mcap", "..mcap", "a\nb.mcap", "\x1b[31m.mcap", f"{'x' * 250}.mcap"])
+def test_a_session_is_named_after_its_file_as_far_as_that_is_a_name(tmp_path: Path, file: str) -> None:
+    folder = MapFolder.open_or_create(tmp_path / "map", load_settings(None))
+    assert folder.folder_of(folder.free_name(Path(file))).parent == tmp_path / "map" / "sessions"

@@ -4,6 +4,7 @@ import sqlite3
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import make_keyframe
 from typer.testing import CliRunner
@@ -99,3 +100,52 @@ def test_views_triggers_and_computed_columns_are_refused(path: Path, trap: str) 
     ):
         with pytest.raises(UmfError, match=f"it holds a.*{trap}"):
             use(path)
+
+
+FOREIGN = {
+    "constraint": [
+        "ALTER TABLE keyframe RENAME TO old",
+        "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, stamp_ns INTEGER NOT NULL CHECK (length(zeroblob(9e8)) > 1), "
+        "session INTEGER NOT NULL, travelled_m REAL, descriptor BLOB NOT NULL, data BLOB NOT NULL)",
+        "INSERT INTO keyframe SELECT * FROM old",
+        "DROP TABLE old",
+    ],
+    "index on an expression": ["CREATE INDEX i ON keyframe (abs(stamp_ns))"],
+    "partial index": ["CREATE UNIQUE INDEX i ON keyframe (session) WHERE session >= 0 AND id < 2"],
+    "another column": ["ALTER TABLE keyframe ADD COLUMN more TEXT DEFAULT 'x'"],
+    "constraint of another table": [
+        "DROP TABLE submap",
+        "CREATE TABLE submap (id INTEGER PRIMARY KEY, keypoints BLOB CHECK (0))",
+    ],
+}
+
+
+@pytest.mark.parametrize("change", FOREIGN)
+def test_tables_that_are_not_ours_to_the_letter_are_refused(path: Path, change: str) -> None:
+    with sqlite3.connect(path) as connection:
+        for statement in FOREIGN[change]:
+            connection.execute(statement)
+    for use in (stored_sessions, stored_identity, partial(delete_sessions, numbers=[0]), database):
+        with pytest.raises(UmfError, match=r"its (table|index) \w+ is not that of a place database"):
+            use(path)
+
+
+@pytest.mark.parametrize(
+    "value", ["stamp_ns = 'yesterday'", "session = x'00'", "travelled_m = 'far'", "stamp_ns = 1.5"]
+)
+def test_a_key_that_is_no_number_is_named_in_one_line(path: Path, value: str) -> None:
+    with sqlite3.connect(path) as connection:
+        connection.execute(f"UPDATE keyframe SET {value} WHERE id = 2")
+    for use in (stored_sessions, partial(delete_sessions, numbers=[0]), database):
+        with pytest.raises(UmfError, match="the stamp, session or path length of keyframe 2 is not a number"):
+            use(path)
+
+
+def test_a_descriptor_that_is_not_finite_is_refused(path: Path) -> None:
+    with sqlite3.connect(path) as connection:
+        (blob,) = connection.execute("SELECT descriptor FROM keyframe WHERE id = 2").fetchone()
+        wrong = np.frombuffer(blob, np.float32).copy()
+        wrong[3] = np.nan
+        connection.execute("UPDATE keyframe SET descriptor = ? WHERE id = 2", (wrong.tobytes(),))
+    with pytest.raises(UmfError, match="the descriptor of keyframe 2 is not finite"):
+        database(path)

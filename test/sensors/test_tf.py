@@ -137,3 +137,12 @@ def test_unknown_parts_are_told_and_two_sources_on_a_topic_refused() -> None:
     with pytest.raises(MessageError, match="two sources on one topic") as caught:
         frames.odometry(other)
     assert caught.value.kind == "frame"
+
+
+def test_names_of_frames_forge_no_line_of_a_log() -> None:
+    told: list[str] = []
+    frames = BodyFrames(FrameIds(), StaticTransforms(), told.append)
+    message = odometry(START_NS, np.eye(4))
+    message.child_frame_id = "base\n[ERROR] [1.0] [other_node]: forged\x1b[2J"
+    frames.odometry(message)
+    assert len(told) == 1 and told[0].isprintable() and r"\x1b[2J" in told[0]

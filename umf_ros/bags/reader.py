@@ -28,7 +28,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
-from umf_ros.core.errors import BagError, MessageError, check_utf8, one_line, reading
+from umf_ros.core.errors import BagError, MessageError, check_utf8, one_line, printable, reading
 from umf_ros.sensors.decode import LIVOX, stamp_ns
 
 LARGEST_CHUNK = 2**28
@@ -160,12 +160,13 @@ class McapFile:
             raise BagError(f"{self.path} holds messages encoded as {encodings}; only those of ROS 2 (cdr) can be read")
         _check_chunks(self.path, summary.chunk_indexes)
         self._channels = {
-            key: (channel.topic, summary.schemas[channel.schema_id].name) for key, channel in channels.items()
+            key: (printable(channel.topic), summary.schemas[channel.schema_id].name)
+            for key, channel in channels.items()
         }
         self.types = dict(self._channels.values())
         for key, count in summary.statistics.channel_message_counts.items():
             if key in channels:
-                self.counts[channels[key].topic] += count
+                self.counts[printable(channels[key].topic)] += count
         self.start_ns, self.end_ns = summary.statistics.message_start_time, summary.statistics.message_end_time
         self._chunks = sorted(summary.chunk_indexes, key=lambda one: (one.message_start_time, one.chunk_start_offset))
 
@@ -218,7 +219,7 @@ class McapFile:
                         channel = channels.get(record.channel_id)
                         if channel and channel.message_encoding == "cdr" and channel.schema_id in schemas:
                             type_name = schemas[channel.schema_id].name
-                            yield _message(channel.topic, record.log_time, type_name, record.data)
+                            yield _message(printable(channel.topic), record.log_time, type_name, record.data)
             except _DAMAGE as error:
                 self._fault = str(error) or type(error).__name__
 
@@ -292,20 +293,20 @@ class RosbagsFile:
         with self._reader(path) as reader:
             connections = self._readable(reader)
             self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
-        self.types = {connection.topic: connection.msgtype for connection in connections}
+        self.types = {printable(connection.topic): connection.msgtype for connection in connections}
         for connection in connections:
-            self.counts[connection.topic] += connection.msgcount
+            self.counts[printable(connection.topic)] += connection.msgcount
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield messages of some topics in the order of their recording."""
         with self._reader(self.path) as reader:
-            wanted = [connection for connection in self._readable(reader) if connection.topic in topics]
+            wanted = [connection for connection in self._readable(reader) if printable(connection.topic) in topics]
             for place, chunk in getattr(reader, "chunks", {}).items():  # of ROS 1
                 limited = _LIMITED.get(chunk.decompressor, chunk.decompressor)
                 reader.chunks[place] = chunk._replace(decompressor=limited)
             for connection, log_ns, data in reader.messages(wanted) if wanted else ():
                 cdr = bytes(self._to_cdr(data, connection.msgtype)) if self._to_cdr else data
-                yield _message(connection.topic, log_ns, connection.msgtype, cdr)
+                yield _message(printable(connection.topic), log_ns, connection.msgtype, cdr)
 
     def _readable(self, reader: Any) -> list[Connection]:
         known = message_types().fielddefs

@@ -9,9 +9,18 @@ LONGEST = 300
 """Most characters of an error's text or of a name in it; both may come from outside."""
 
 
-def shortened(text: object) -> str:
-    """Return a text on one line, with the middle of a long one left out."""
+def printable(text: object) -> str:
+    """Return a text from outside on one line, with control characters and marks of direction escaped.
+
+    Names of frames, topics and files could otherwise forge lines of a log, or control a terminal.
+    """
     line = " ".join(str(text).split())
+    return line if line.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+
+
+def shortened(text: object) -> str:
+    """Return a printable text, with the middle of a long one left out."""
+    line = printable(text)
     return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 3 :]}"
 
 
@@ -33,7 +42,11 @@ def one_line(error: BaseException) -> str:
 
 
 class UmfError(Exception):
-    """Base of the package's own errors; the text is one line for the user."""
+    """Base of the package's own errors; the text is one printable line for the user."""
+
+    def __init__(self, text: object = "") -> None:
+        # a text that is fine is kept as the object that it is, such as a reason
+        super().__init__(text if isinstance(text, str) and printable(text) == text else printable(text))
 
 
 class MessageError(UmfError):

@@ -81,6 +81,24 @@ def check_writable(folder: Path) -> None:
         raise OutputError(f"cannot write to {folder}: permission denied")
 
 
+def inside(folder: Path, name: str) -> Path:
+    """Return the path of a file whose name comes from outside, such as from a file that others made.
+
+    Raises:
+        UmfError: the name is not a plain one, or a link leads out of the folder.
+    """
+    path = folder / name
+    if name != plain_name(name) or path.resolve().parent != folder.resolve():
+        raise UmfError(f"{shortened(name)!r} is not the name of a file in {folder}")
+    return path
+
+
+def plain_name(text: str) -> str:
+    """Return a text as the name of a file: printable, without separators, of at most 120 characters."""
+    letters = (letter if letter.isprintable() and letter not in "/\\" else "_" for letter in text)
+    return "".join(letters)[:120].strip(". ") or "unnamed"
+
+
 def create_run_folder(out: Path, latest: bool = True) -> Path:
     """Make a new folder inside `out`, named after the local time; `out/latest` links to it unless `latest` is false."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
@@ -276,6 +294,8 @@ class SqliteFile:
         if found > len(schema.migrations):
             latest = len(schema.migrations)
             raise UmfError(f"{self.name} has version {found} of a {schema.name}, this umf_ros reads {latest}")
+        if found:
+            self._check_tables(schema, found)
         return found
 
     def _tables(self) -> set[str]:
@@ -296,6 +316,32 @@ class SqliteFile:
                 columns = self.connection.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,))
             if any(hidden for (hidden,) in columns):
                 raise ValueError("it holds a table with computed columns")
+
+    def _check_tables(self, schema: Schema, version: int) -> None:
+        """Check that the tables of a schema and all that belongs to them are those of its version to the letter.
+
+        Constraints and indices on expressions run code.
+
+        Raises:
+            ValueError: they are not.
+        """
+        with closing(sqlite3.connect(":memory:")) as empty:
+            statements = [_VERSIONS, *chain.from_iterable(schema.migrations[:version])]
+            for statement in statements:
+                if statement.startswith(("CREATE", "ALTER")):
+                    empty.execute(statement)
+            expected = {row[:3]: _letters(row[3]) for row in empty.execute(_OBJECTS)}
+        tables = {table for _, _, table in expected}
+        for *key, text in self.connection.execute(_OBJECTS):
+            if key[2] in tables and expected.get(tuple(key)) != _letters(text):
+                raise ValueError(f"its {key[0]} {shortened(key[1])} is not that of a {schema.name}")
+
+
+_OBJECTS = "SELECT type, name, tbl_name, sql FROM sqlite_master WHERE sql IS NOT NULL"
+
+
+def _letters(statement: str) -> str:
+    return "".join(letter for letter in statement if letter not in '"`[] \n\t').lower()
 
 
 LARGEST_YAML = 2**22

@@ -24,6 +24,10 @@ SEARCHED = 100
 """Candidate list of the search in the server's graph (`hnsw.ef_search`): recall against time."""
 TIMEOUT_S = 5.0
 """Time after which a server without an answer counts as disconnected."""
+NORM_SLACK = 0.02
+"""Largest difference of a descriptor's norm from 1, in half precision: a longer one would be first in every query."""
+LARGEST_PLACE = 2**23
+"""Most bytes of a packed keyframe; those of dense scans have some hundred thousand."""
 _KEY = "robot text, store uuid, session integer, stamp_ns bigint"
 _KEY_NAMES = "robot, store, session, stamp_ns"
 MIGRATIONS = (
@@ -46,19 +50,38 @@ MIGRATIONS = (
         f"GRANT SELECT ON fleet, fleet_version TO {ROVERS}",
         f"GRANT SELECT, INSERT ON place, place_data TO {ROVERS}",
     ),
+    (
+        # a member of the role of all rovers may become that role, but not another user of the session
+        "DROP POLICY its_own ON place",
+        "DROP POLICY its_own ON place_data",
+        "CREATE POLICY its_own ON place FOR INSERT WITH CHECK (robot = session_user)",
+        "CREATE POLICY its_own ON place_data FOR INSERT WITH CHECK (robot = session_user)",
+        # not valid: stored rows are checked by the reader
+        f"ALTER TABLE place ADD CHECK (abs(l2_norm(descriptor) - 1) < {NORM_SLACK}) NOT VALID",
+        f"ALTER TABLE place_data ADD CHECK (octet_length(data) <= {LARGEST_PLACE}) NOT VALID",
+    ),
 )
 """Statements that lead from version n to n + 1; a released migration is never changed, only added to."""
-_INSERT = "INSERT INTO place VALUES (current_user, %s, %s, %s, %s, %s) ON CONFLICT DO NOTHING"
-_INSERT_DATA = "INSERT INTO place_data VALUES (current_user, %s, %s, %s, %s) ON CONFLICT DO NOTHING"
+_INSERT = "INSERT INTO place VALUES (session_user, %s, %s, %s, %s, %s) ON CONFLICT DO NOTHING"
+_INSERT_DATA = "INSERT INTO place_data VALUES (session_user, %s, %s, %s, %s) ON CONFLICT DO NOTHING"
 _NEAREST = (
-    "SELECT robot, store, session, stamp_ns, -(descriptor <#> %s) FROM place WHERE robot <> current_user::text "
+    "SELECT robot, store, session, stamp_ns, -(descriptor <#> %s) FROM place WHERE robot <> session_user::text "
     "ORDER BY descriptor <#> %s LIMIT %s"
 )
 _ALONG = (
     f"SELECT DISTINCT ON (step) floor(travelled_m / %s) AS step, {_KEY_NAMES} FROM place WHERE robot = %s AND "
     "store = %s AND session = %s AND travelled_m BETWEEN %s AND %s ORDER BY step, stamp_ns"
 )
-_DATA = "SELECT data FROM place_data WHERE robot = %s AND store = %s AND session = %s AND stamp_ns = %s"
+_DATA = (
+    "SELECT data FROM place_data WHERE robot = %s AND store = %s AND session = %s AND stamp_ns = %s AND "
+    f"octet_length(data) <= {LARGEST_PLACE}"
+)
+_KNOWN_ROLE = (
+    "SELECT NOT (rolsuper OR rolcreaterole OR rolcreatedb OR rolreplication OR rolbypassrls) AND EXISTS (SELECT 1 FROM "
+    "pg_auth_members JOIN pg_roles AS groups ON groups.oid = roleid WHERE groups.rolname = %s AND member = one.oid) "
+    "FROM pg_roles AS one WHERE rolname = %s"
+)
+"""Whether a known role is a rover's: a member of the role of rovers that administers nothing."""
 
 
 def migrate(connection: Connection, embedder: str, dimension: int) -> tuple[int, int]:
@@ -87,9 +110,15 @@ def migrate(connection: Connection, embedder: str, dimension: int) -> tuple[int,
 
 
 def add_rover(connection: Connection, name: str, password: str) -> None:
-    """Add a rover's role, or change its password; the server gets the password's verifier only."""
+    """Add a rover's role, or change its password; the server gets the password's verifier only.
+
+    Raises:
+        UmfError: the name is that of a role that is no rover.
+    """
     verifier = connection.pgconn.encrypt_password(password.encode(), name.encode(), b"scram-sha-256").decode()
-    known = connection.execute("SELECT 1 FROM pg_roles WHERE rolname = %s", (name,)).fetchone()
+    known = connection.execute(_KNOWN_ROLE, (ROVERS, name)).fetchone()
+    if known == (False,):
+        raise UmfError(f"{name} is a role of the server that is no rover: its password was not changed")
     verb = sql.SQL("ALTER ROLE" if known else "CREATE ROLE")
     with connection.transaction():
         parts = verb, sql.Identifier(name), sql.Literal(verifier)
@@ -165,7 +194,8 @@ class FleetServer:
         vector = HalfVector(descriptor)
         with _link():
             rows = self._connection.execute(_NEAREST, (vector, vector, count)).fetchall()
-        return [(FleetKey(*key), float(similarity)) for *key, similarity in rows]
+        most = 1 + 2 * NORM_SLACK
+        return [(FleetKey(*key), float(similarity)) for *key, similarity in rows if abs(similarity) <= most]
 
     def along(self, key: FleetKey, first_m: float, last_m: float, step_m: float) -> list[FleetKey]:
         """Return keyframes on a part of the path of a keyframe's session, in its order, one of every step."""
@@ -174,7 +204,7 @@ class FleetServer:
         return [FleetKey(*row[1:]) for row in rows]
 
     def data(self, key: FleetKey) -> bytes | None:
-        """Return a packed keyframe; None where there is none."""
+        """Return a packed keyframe; None where there is none, or one of more than `LARGEST_PLACE` bytes."""
         with _link():
             row = self._connection.execute(_DATA, key, binary=True).fetchone()
         return row[0] if row else None
@@ -194,7 +224,7 @@ class FleetServer:
         register_vector(self._connection)
         self._connection.execute("SELECT set_config('hnsw.ef_search', %s, false)", (str(SEARCHED),))
         self._connection.execute("SET hnsw.iterative_scan = strict_order")
-        row = self._connection.execute("SELECT current_user::text").fetchone()
+        row = self._connection.execute("SELECT session_user::text").fetchone()
         return str(row[0]) if row else ""
 
 

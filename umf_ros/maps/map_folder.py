@@ -12,11 +12,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import OutputError, UmfError, reading, writing
 from umf_ros.core.frames import State
-from umf_ros.core.io import write_atomically
+from umf_ros.core.io import inside, plain_name, write_atomically
 from umf_ros.places.database import PLACES_OF_MAP
 from umf_ros.runs.run_file import RunFile
 from umf_ros.sensors.decode import OdometrySample
@@ -80,7 +82,10 @@ class MapFolder:
             content = json.loads((path / "map.json").read_text(encoding="utf-8"))
             if content["schema"] != SCHEMA_VERSION:
                 raise UmfError(f"{path} is from another version of umf_ros; rebuild the map from its recordings")
-            folder.sessions = [MapSession(**session) for session in content["sessions"]]
+            sessions = json.dumps(content["sessions"])
+            folder.sessions = TypeAdapter(list[MapSession]).validate_json(sessions, strict=True)
+            for session in folder.sessions:
+                folder.folder_of(session.name)
         return folder
 
     @classmethod
@@ -110,8 +115,8 @@ class MapFolder:
         return self.path / PLACES_OF_MAP
 
     def folder_of(self, name: str) -> Path:
-        """Run folder of a recording, stamped by its own clock."""
-        return self.path / "sessions" / name
+        """Run folder of a recording, stamped by its own clock; raises an `UmfError` if the name leads elsewhere."""
+        return inside(self.path / "sessions", name)
 
     def inputs_of(self, name: str) -> tuple[list[OdometrySample], list[AbsoluteMeasurement]]:
         """Return the odometry and the absolute measurements of a recording, stamped by its own clock."""
@@ -133,7 +138,8 @@ class MapFolder:
     def free_name(self, path: Path, reserved: Collection[str] = ()) -> str:
         """Return a session name for a recording that is neither taken nor reserved."""
         taken = {session.name for session in self.sessions} | set(reserved)
-        names = (path.stem if number == 1 else f"{path.stem}_{number}" for number in range(1, len(taken) + 2))
+        stem = plain_name(path.stem)
+        names = (stem if number == 1 else f"{stem}_{number}" for number in range(1, len(taken) + 2))
         return next(name for name in names if name not in taken)
 
     def shift_for(self, first_ns: int) -> int:

@@ -56,7 +56,7 @@ FEATURES: dict[str, type[LocalFeatures] | type[SuperFeatures]] = {
     "super_image": SuperFeatures,
     "super_cloud": SuperFeatures,
 }
-_SHAPES = {"points": (3,), "body_T_camera": (4, 4), "body_T_lidar": (4, 4), "odom_T_body": (4, 4)}
+_SHAPES = {"descriptor": (), "points": (3,), "body_T_camera": (4, 4), "body_T_lidar": (4, 4), "odom_T_body": (4, 4)}
 """Last dimensions of the geometric arrays."""
 _KEYS = np.dtype([("id", np.int64), ("stamp_ns", np.int64), ("session", np.int64), ("travelled_m", np.float64)])
 
@@ -125,7 +125,11 @@ class KeyframeStore:
         statement = f"SELECT id, descriptor FROM keyframe WHERE id IN ({','.join('?' * len(ids))})"
         with self._reading() as connection:
             blobs = dict(connection.execute(statement, ids))
-            return np.frombuffer(b"".join(blobs[one] for one in ids), np.float32).reshape(-1, self._dimension)
+            found = np.frombuffer(b"".join(blobs[one] for one in ids), np.float32).reshape(-1, self._dimension)
+            if not np.isfinite(found).all():
+                row = ids[int(np.argmin(np.isfinite(found).all(axis=1)))]
+                raise ValueError(f"the descriptor of keyframe {row} is not finite")
+            return found
 
     def rows_at(self, stamp_ns: int) -> list[int]:
         """Return indices of the keyframes of a stamp, in order."""
@@ -247,7 +251,7 @@ def unpack(blob: bytes) -> Keyframe:
     arrays = load(blob)
     for name, shape in _SHAPES.items():
         found = arrays.get(name)
-        if found is not None and (found.shape[-len(shape) :] != shape or not np.isfinite(found).all()):
+        if found is not None and (found.shape[found.ndim - len(shape) :] != shape or not np.isfinite(found).all()):
             raise ValueError(f"{name} has a wrong shape or is not finite")
     stamp_ns, session = (int(number) for number in arrays["stamp_session"])
     width, height, *rest = (float(number) for number in arrays["camera"])
@@ -287,6 +291,7 @@ def stored_sessions(path: Path) -> list[StoredSession]:
     """Return the sessions of a place database; another process may write it."""
     columns = "SELECT session, count(*), min(stamp_ns), max(stamp_ns) FROM keyframe GROUP BY session"
     with _open_read_only(path) as connection:
+        _check_keys(connection)
         return [StoredSession(*row) for row in connection.execute(columns)]
 
 
@@ -343,7 +348,15 @@ def _check_identity(connection: sqlite3.Connection, name: str, identity: tuple[s
         raise UmfError(f"{name} was made with {'; '.join(wrong)}")
 
 
+def _check_keys(connection: sqlite3.Connection) -> None:
+    """Raise a `ValueError` if a key is not a number: SQLite keeps values of any type in any column."""
+    wrong = "typeof(stamp_ns) != 'integer' OR typeof(session) != 'integer' OR typeof(travelled_m) IN ('text', 'blob')"
+    if found := connection.execute(f"SELECT id FROM keyframe WHERE {wrong} LIMIT 1").fetchone():
+        raise ValueError(f"the stamp, session or path length of keyframe {found[0]} is not a number")
+
+
 def _read_keys(connection: sqlite3.Connection) -> NDArray[np.void]:
+    _check_keys(connection)
     # SQLite keeps a NaN as NULL; 9e999 is infinity
     columns = "SELECT id, stamp_ns, session, ifnull(travelled_m, 9e999) FROM keyframe"
     keys = np.fromiter(connection.execute(columns), _KEYS)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from umf_ros.core.config import Topics
-from umf_ros.core.errors import MessageError
+from umf_ros.core.errors import MessageError, printable
 from umf_ros.sensors.decode import (
     OdometrySample,
     decode_camera_info,
@@ -57,7 +57,7 @@ class MessageRouter:
         self._read_odometry = frames.odometry if frames is not None else OdometryDecoder(warn).decode
         self._synchronizer = synchronizer
         self._on_odometry = on_odometry
-        self._warn = warn
+        self._warn = lambda text: warn(printable(text))  # topics come from outside
         self._warned: set[tuple[str, str]] = set()
         self._is_raw = "rect" not in topics.left_image
         self._stereo_info = bool(topics.right_info and topics.right_image)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from umf_ros.core.config import FrameIds
-from umf_ros.core.errors import MessageError
+from umf_ros.core.errors import MessageError, printable
 from umf_ros.core.geometry import Array, from_quaternion, invert
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import OdometrySample
@@ -102,7 +102,8 @@ class BodyFrames:
         calibration: Calibration | None = None,
     ) -> None:
         """Without a calibration, `mounting` returns no poses."""
-        self._base, self._transforms, self._warn = frames.base, transforms, warn
+        self._base, self._transforms = frames.base, transforms
+        self._warn = lambda text: warn(printable(text))  # names of frames come from outside
         self._decoder = OdometryDecoder(warn)
         self._calibration = calibration
         self._mounted: dict[str, tuple[str, int]] = {}

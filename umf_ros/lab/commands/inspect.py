@@ -56,10 +56,11 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
     from rich.markup import escape
     from rich.table import Table
 
+    from umf_ros.core.errors import printable
     from umf_ros.runs.report import COLOURS
     from umf_ros.sensors.topic_finder import describe_inputs
 
-    console.print(f"{bag}: {recording.duration_s:.1f} s", **PLAIN)
+    console.print(f"{printable(bag)}: {recording.duration_s:.1f} s", **PLAIN)
     if recording.warning:
         console.print(recording.warning, style="yellow", **PLAIN)
     table = Table("input", "topic", "rate", "what it is", box=None, pad_edge=False)
@@ -76,7 +77,7 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
     for one in found.advice:
         console.print(f"{one.severity}: {one.line}", style=COLOURS[one.severity], **PLAIN)
     if found.settings is not None:
-        console.print(f"{describe_inputs(found.settings)}; umf replay {bag} needs no --config", **PLAIN)
+        console.print(f"{describe_inputs(found.settings)}; umf replay {printable(bag)} needs no --config", **PLAIN)
 
 
 def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> None:

@@ -16,7 +16,7 @@ from umf_ros.bags.presets import detect_dataset, settings_for
 from umf_ros.bags.reader import Bag, decode
 from umf_ros.bags.sensor_check import SensorCheck, SensorReport
 from umf_ros.core.config import Settings, Topics, load_preset, topics_of
-from umf_ros.core.errors import BagError, MessageError, UmfError, either
+from umf_ros.core.errors import BagError, MessageError, UmfError, either, printable
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
 from umf_ros.core.trajectory import Trajectory, bracket
@@ -131,7 +131,8 @@ def _info_words(message: Any) -> str:
 
 def _odometry_words(message: Any) -> str:
     decode_odometry(message)
-    return f"of {message.child_frame_id or 'no named frame'} in {message.header.frame_id or 'no named frame'}"
+    child, parent = (printable(name) or "no named frame" for name in (message.child_frame_id, message.header.frame_id))
+    return f"of {child} in {parent}"
 
 
 _DESCRIBE: dict[str, Any] = {
@@ -223,7 +224,7 @@ def write_calibration(found: Inspected, transforms: StaticTransforms) -> str:
     """A first calibration: intrinsics of the camera_info, mountings of /tf_static, and what has to be measured."""
     lines = ["# Written by umf inspect. Metres, quaternions x y z w; poses in the body frame (x ahead, y left, z up)."]
     lines += _camera_lines(found)
-    frames = {name: message.header.frame_id for name, message in found.messages.items()}
+    frames = {name: printable(message.header.frame_id) for name, message in found.messages.items()}
     named = [frames[name] for name in ("cloud", "left_image") if frames.get(name)]
     bodies = [body for frame in named for body in BODIES if transforms.find(body, frame) is not None]
     body = bodies[0] if bodies else ""
