@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
@@ -216,6 +217,13 @@ class OdometrySessionSplitter:
             self._graph.add_odometry(one.stamp_ns, one.value)  # late ones too: the graph sorts them in
             self.newest_ns = max(self.newest_ns, one.stamp_ns)
         return reset or restart
+
+    def learn(self, messages: Iterable[tuple[int, Array]]) -> None:
+        """Take messages that were passed on before a restart, and those of long ago not all."""
+        for stamp_ns, odom_T_body in messages:
+            self._clock.take(StampedInput(ODOMETRY, stamp_ns, odom_T_body))
+            self._recent.append((stamp_ns, odom_T_body))
+            self.newest_ns = max(self.newest_ns, stamp_ns)
 
     def _restart(self, stamp_ns: int, odom_T_body: Array) -> Reset | None:
         """Return the reset after an interruption; None when the odometry continues, or there was none before."""
