@@ -129,16 +129,18 @@ class DurableGraph:
         All are logged before closures are decided about, which ends when the time is up; `update` goes on with that.
         """
         rows, verdicts, resets = list[tuple[Any, ...]](), list[ClosureVerdict](), list[Reset]()
-        for item in inputs:
-            self._event += 1
-            new = self.graph.receive([item]) if isinstance(item, LoopClosure) else []
-            if new or not isinstance(item, LoopClosure):
+        for kind, group in groupby(inputs, key=type):
+            items: list[Any] = list(group)
+            if kind is LoopClosure:
+                new = self.graph.receive(items)
+                verdicts, items = verdicts + new, [verdict.closure for verdict in new]
+            for item in items:
+                self._event += 1
                 rows.append((self._event, *_row(item)))
-            verdicts += new
-            if isinstance(item, AbsoluteMeasurement):
-                self.graph.add_absolute(item)
-            elif isinstance(item, OdometrySample) and (reset := self.feed.take(item.stamp_ns, item.odom_T_body)):
-                resets.append(reset)
+                if kind is AbsoluteMeasurement:
+                    self.graph.add_absolute(item)
+                elif kind is OdometrySample and (reset := self.feed.take(item.stamp_ns, item.odom_T_body)):
+                    resets.append(reset)
         if rows:
             self._write((_EVENT, rows))
         self._condense()

@@ -26,6 +26,7 @@ from umf_ros.core.geometry import (
     near,
     propagate,
     relative,
+    ros_to_gtsam_covariance,
 )
 from umf_ros.core.odometry_noise import OdometryNoise
 from umf_ros.core.trajectory import Trajectory, write_tum
@@ -234,12 +235,13 @@ class Localizer(PoseGraph):
         """Compare the pose by a closure with every hypothesis, and add one if none agrees."""
         at, match = self._sample(closure.query_stamp_ns), self._map.get(closure.match_stamp_ns)
         try:
-            covariance = check_closure(closure, self._settings.max_closure_m) + np.diag(_MAP_SIGMAS**2)
+            check_closure(closure, self._settings.max_closure_m)
         except GraphError:
             at = None
         if at is None or match is None:
             return ClosureReason.NOT_OF_MAP
         pose = match @ closure.match_T_query
+        covariance = ros_to_gtsam_covariance(closure.covariance, closure.match_T_query) + np.diag(_MAP_SIGMAS**2)
         gain = trust = min(_logit(closure.probability), _MOST_PER_CLOSURE)
         agreed = [one for one in self._hypotheses if self._correct(one, at, pose, covariance)]
         for one in agreed:

@@ -43,6 +43,8 @@ STATIC_QOS = latched(100)
 ODOMETRY_DEPTH = 200
 WATCH_S = 1.0
 HEARTBEAT_S = 0.05
+FAULT_S = 10.0
+"""Time after a fault until it leaves the status of the node."""
 CLOCK_PATIENCE_S = 30.0
 """Longest start of a bag player beside the nodes, for which it waits, on a busy machine."""
 SIM_TIME_SILENT = "use_sim_time is set, but /clock is silent: message stamps are used, the age of the pose is unknown"
@@ -74,7 +76,7 @@ class BaseNode(LifecycleNode, ABC):
         self.failure: UmfError | None = None
         self._watches: list[InputWatch] = []
         self._own: list[Any] = []
-        self._faults, self._last_fault = Counter[str](), ""
+        self._faults, self._last_fault, self._fault_s = Counter[str](), "", -math.inf
         self._logged_s: dict[str, float] = {}
         self._clockless_s = 0.0
         self._active = self._opened = self._leaving = False
@@ -376,7 +378,7 @@ class BaseNode(LifecycleNode, ABC):
     def _judge(self, own: DiagnosticStatus) -> DiagnosticStatus:
         """Return the node's own status, degraded by silent inputs and recent faults."""
         troubles = [watch.warning for watch in self._watches if watch.warning]
-        troubles += [f"last fault: {self._last_fault}"] if self._last_fault else []
+        troubles += [f"last fault: {self._last_fault}"] if self._last_fault and self._has_fault else []
         if troubles or not self._active:
             own.level = max(own.level, WARN)
             own.message = "; ".join([own.message, *troubles]) if self._active else "inactive"
@@ -386,6 +388,7 @@ class BaseNode(LifecycleNode, ABC):
         """Count a fault; log the first of each kind at once, later ones at a limited rate."""
         kind = error.kind if isinstance(error, MessageError) else type(error).__name__
         self._faults[kind] += 1
+        self._fault_s = time.monotonic()
         where = f"{what}: " if what else ""
         if isinstance(error, MessageError):
             if self._faults[kind] == 1:
@@ -397,8 +400,13 @@ class BaseNode(LifecycleNode, ABC):
             self.get_logger().error(f"{where}{kind}: {text} ({self._faults[kind]} so far); the node continues")
 
     @property
+    def _has_fault(self) -> bool:
+        """Whether a fault is so recent that it may not be over."""
+        return time.monotonic() - self._fault_s < FAULT_S
+
+    @property
     def _cannot_write(self) -> bool:
-        return self._faults["OutputError"] > 0 and "write" in self._last_fault
+        return self._has_fault and self._faults["OutputError"] > 0 and "write" in self._last_fault
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:

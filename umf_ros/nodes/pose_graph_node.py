@@ -289,7 +289,7 @@ class PoseGraphNode(BaseNode):
             text = "in the map" if state.map_T_odom is not None else "not localised in the map yet"
         if values.get("pending") and state.newest_ns < 0:
             trouble, text = True, f"{values['pending']} closures pending: no odometry received"
-        level = ERROR if self._cannot_write else WARN if trouble or self._faults else OK
+        level = ERROR if self._cannot_write else WARN if trouble or self._has_fault else OK
         return status(level, "pose graph", text, values)
 
     def _reject_last(self) -> str:

@@ -118,18 +118,14 @@ def as_closures(placed: PlacedClosure, row: int, chains: Sequence[OdometryChain]
     return found
 
 
-def check_closure(closure: LoopClosure, max_length_m: float) -> Array:
-    """Return the (6, 6) covariance of a usable closure in GTSAM's order, tangent space of the query.
-
-    Raises a `GraphError` with a `ClosureReason`, as the other checks do.
-    """
+def check_closure(closure: LoopClosure, max_length_m: float) -> None:
+    """Refuse an unusable closure by a `GraphError` with a `ClosureReason`, as the other checks do."""
     if closure.query_stamp_ns == closure.match_stamp_ns:
         raise GraphError(ClosureReason.ITSELF)
     check_pose(closure.match_T_query)
     if float(np.linalg.norm(closure.match_T_query[:3, 3])) > max_length_m:
         raise GraphError(ClosureReason.TOO_LONG)
     check_covariance(closure.covariance)
-    return ros_to_gtsam_covariance(closure.covariance, closure.match_T_query)
 
 
 def check_pose(pose: Array) -> None:
