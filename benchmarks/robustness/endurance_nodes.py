@@ -108,6 +108,7 @@ class Ears(Node):
         keyframes: stamps of the keyframes that were announced.
         closures: pairs of stamps on `loop_closures`, match and query.
         verdicts: seconds of the monotonic clock at the back-end's first verdict on each of these.
+        decided: those of them that were accepted or rejected.
         values: latest diagnostics by node's full name, then by line.
     """
 
@@ -118,6 +119,7 @@ class Ears(Node):
         self.keyframes: set[int] = set()
         self.closures: set[tuple[int, int]] = set()
         self.verdicts: dict[tuple[int, int], float] = {}
+        self.decided: set[tuple[int, int]] = set()
         self.values: dict[str, dict[str, dict[str, str]]] = {}
         at = f"/{namespace}/" if namespace else "/"
         self.create_subscription(PoseStamped, f"{at}{FRONT_END}/keyframes", self._hear_keyframe, CLOSURES_QOS)
@@ -166,6 +168,8 @@ class Ears(Node):
         for status in message.status:
             match, _, query = status.name.partition(" ")
             self.verdicts.setdefault((_stamp(match), _stamp(query)), time.monotonic())
+            if {"accepted", "rejected"} & {pair.value for pair in status.values}:
+                self.decided.add((_stamp(match), _stamp(query)))
 
     def _hear_health(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -44,7 +44,8 @@ TOPICS: dict[str, tuple[type, Any]] = {
 QUERY_NS = 1_667_000_100_123_456_789
 MATCH_NS = 1_667_000_000_000_000_001
 POSE = make_pose(Rotation.from_euler("zyx", [20, -3, 5], degrees=True).as_matrix(), [1.5, -0.75, 0.25])
-COVARIANCE = np.arange(36.0).reshape(6, 6) + 100 * np.eye(6)
+UPPER = np.triu(np.arange(36.0).reshape(6, 6))
+COVARIANCE = UPPER + UPPER.T + 100 * np.eye(6)
 
 
 class Talk:
