@@ -218,9 +218,8 @@ def backlogs(folder: Path, number: int = 10_000, latched: int = 5000) -> Figures
     right = [_later(world, row) for row in range(len(world.closures))]
     alike = [replace(right[0], match_stamp_ns=FAR_NS + k, query_stamp_ns=FAR_NS + 10**11 + k) for k in range(number)]
     ends = np.sort(rng.integers(1, 500, (number, 2)), axis=1) * PERIOD_NS
-    wrong = [
-        replace(one, match_stamp_ns=int(a), query_stamp_ns=int(b)) for one, (a, b) in zip(alike, ends, strict=True)
-    ]
+    pairs = zip(alike, ends.tolist(), strict=True)
+    wrong = [replace(one, match_stamp_ns=match, query_stamp_ns=query) for one, (match, query) in pairs]
     kinds = {
         "waiting": alike,
         "contradicting": [one for one in wrong if one.query_stamp_ns > one.match_stamp_ns],
@@ -261,10 +260,10 @@ def _backlog(folder: Path, world: GraphWorld, closures: list[LoopClosure], right
             ears.spin_once(0.002)
         if not early:
             send()
-        sent_s = time.monotonic()
+        sent_s = time.time()
         sender.publish(closure_to_message(right))
         ears.until(lambda: right.pair in ears.decided, 120.0)
-        decision_s = time.monotonic() - sent_s
+        decision_s = ears.decided.get(right.pair, float("inf")) - sent_s
         shutdown_s, status = node.stop()
         ears.destroy_node()
     return {

@@ -151,13 +151,12 @@ def kill_both(folder: Path, kills: int, bag: Path, config: Path, rng: np.random.
     parameters: dict[str, object] = {"database.path": results / "places.sqlite"}
     crashes, nodes = 0, dict[str, NodeUnderTest]()
     with own_domain():
-        ears = Ears()
+        ears, player = Ears(), play(bag, "--rate", "0.5")
         for number in range(kills + 1):
             for name in (FRONT_END, BACK_END):
                 if name not in nodes:
                     nodes[name] = NodeUnderTest(name, results, parameters, config=config)
                     crashes += not ears.anew(name)
-            player = player if number else play(bag, "--rate", "0.5")
             enough = len(ears.closures) + 2
             ears.until(lambda: len(ears.closures) >= enough or player.poll() is not None, 60.0)  # noqa: B023 (at once)
             for name in ORDERS[number % len(ORDERS)] if number < kills else ():
@@ -188,7 +187,7 @@ def kill_both(folder: Path, kills: int, bag: Path, config: Path, rng: np.random.
 
 
 def _pairs(path: Path) -> set[tuple[str, str]]:
-    with path.open(newline="") as file:
+    with path.open(encoding="utf-8", newline="") as file:
         return {(row["match_stamp_ns"], row["query_stamp_ns"]) for row in csv.DictReader(file)}
 
 
