@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from endurance_live import MANY
+from endurance_live import DISCOVERY_S, MANY
 from endurance_nodes import BACK_END, Ears, NodeUnderTest, own_domain
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
@@ -251,13 +251,15 @@ def _backlog(folder: Path, world: GraphWorld, closures: list[LoopClosure], right
             send()
         node = NodeUnderTest(BACK_END, folder, {"pose_graph.max_gap_s": 3.0})
         ears.anew(BACK_END)
-        ears.wait(1.0)
+        ears.until(odometry.get_subscription_count)
+        ears.wait(DISCOVERY_S)
         for k, pose in enumerate(world.odometry):
             message = Odometry(child_frame_id="base_link")
             message.header.stamp, message.header.frame_id = to_time((k + 1) * PERIOD_NS), "odom"
             message.pose.pose = to_pose(pose)
             odometry.publish(message)
             ears.spin_once(0.002)
+        ears.until(lambda: ears.value(BACK_END, "pose graph", "odometry") >= len(world.odometry) - 5, 20.0)
         if not early:
             send()
         sent_s = time.time()

@@ -41,6 +41,8 @@ from umf_ros.sensors.topic_finder import FRONT_END, SETTLING_S, TopicFinder, des
 STATIC_QOS = latched(100)
 """Deep enough for several broadcasters, each with a part of the tree."""
 ODOMETRY_DEPTH = 200
+BURST = 500
+"""Messages of a rare input that are received at once."""
 WATCH_S = 1.0
 HEARTBEAT_S = 0.05
 FAULT_S = 10.0
@@ -299,8 +301,18 @@ class BaseNode(LifecycleNode, ABC):
         def lose(event: Any) -> None:
             watch.lost += event.total_count_change
 
+        guarded = self._guarded(name, receive)
+
+        def receive_waiting(message: Any) -> None:
+            """Receive a message and, of a rare input, those behind it: the executor takes a millisecond for each."""
+            guarded(message)
+            for _ in range(BURST if rare else 0):
+                if (taken := subscription.handle.take_message(kind, False)) is None:
+                    break
+                guarded(taken[0])
+
         events = SubscriptionEventCallbacks(message_lost=lose)
-        subscription = self.create_subscription(kind, topic, self._guarded(name, receive), qos, event_callbacks=events)
+        subscription = self.create_subscription(kind, topic, receive_waiting, qos, event_callbacks=events)
         watch = InputWatch(self, name, subscription.topic_name, kind, rare)
         self._watches.append(watch)
 
