@@ -16,6 +16,7 @@ from umf_ros.durable_graph import DurableGraph
 from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.live.live_graph import settle_left
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
+from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import CONFIRMING
 
 SETTINGS = PoseGraphSettings(max_gap_s=3)
@@ -33,12 +34,12 @@ def made(path: Path | None, faults: list[OutputError] | None = None) -> DurableG
 def drive(graph: DurableGraph, world: GraphWorld, first: int, last: int) -> None:
     """The part of the drive between two poses, with the closures that end there."""
     for k in range(first, last):
-        graph.take_odometry((k + 1) * PERIOD_NS, world.odometry[k])
+        graph.take([OdometrySample((k + 1) * PERIOD_NS, world.odometry[k])])
         for row, (_, query, *_) in enumerate(world.closures):
             if query == k:
                 message = world.message(row)
                 stamps = message.query_stamp_ns + PERIOD_NS, message.match_stamp_ns + PERIOD_NS
-                graph.add_closure(LoopClosure(*stamps, message.match_T_query, message.covariance))
+                graph.take([LoopClosure(*stamps, message.match_T_query, message.covariance)])
         graph.update()
 
 
@@ -82,8 +83,7 @@ def test_odometry_goes_on_after_a_restart_only_if_it_can_be_the_same(
     again = made(tmp_path / "graph.sqlite")
     pose = world.odometry[49].copy()
     pose[0, 3] += moved_m
-    for i in range(CONFIRMING):
-        again.take_odometry((50 + i) * PERIOD_NS + pause_s * 10**9, pose)
+    again.take([OdometrySample((50 + i) * PERIOD_NS + pause_s * 10**9, pose) for i in range(CONFIRMING)])
     assert len(again.graph._sessions.chains) == sessions
 
 
@@ -92,8 +92,8 @@ def test_odometry_that_begins_at_its_origin_is_another(world: GraphWorld, tmp_pa
     drive(graph, world, 0, 3)
     graph.close()
     again = made(tmp_path / "graph.sqlite")
-    resets = [again.take_odometry((8 + i) * PERIOD_NS, np.eye(4)) for i in range(CONFIRMING)]
-    assert resets[-1] is not None and "origin" in resets[-1].reason
+    (reset,) = again.take([OdometrySample((8 + i) * PERIOD_NS, np.eye(4)) for i in range(CONFIRMING)])[1]
+    assert "origin" in reset.reason
 
 
 def test_closures_that_are_told_again_after_a_restart_count_once(world: GraphWorld, tmp_path: Path) -> None:
@@ -101,11 +101,10 @@ def test_closures_that_are_told_again_after_a_restart_count_once(world: GraphWor
     drive(graph, world, 0, len(world.truth))
     graph.close()
     again = made(tmp_path / "graph.sqlite")
-    for i in range(CONFIRMING):  # another session begins
-        again.take_odometry(10**18 + i * PERIOD_NS, np.eye(4))
+    again.take([OdometrySample(10**18 + i * PERIOD_NS, np.eye(4)) for i in range(CONFIRMING)])  # another session begins
     told = [verdict.closure for verdict in graph.graph.closures()]
     for closure in told:
-        again.add_closure(closure)
+        again.take([closure])
     assert len(again.graph.closures()) == len(told) == again.graph.counts["closure twice"]
 
 
@@ -179,7 +178,7 @@ def test_a_journal_that_cannot_be_written_costs_no_closure(world: GraphWorld, tm
 def test_a_closure_from_before_the_first_odometry_is_told_soon(world: GraphWorld) -> None:
     graph = made(None)
     drive(graph, world, 150, 160)
-    graph.add_closure(world.message(0))
+    graph.take([world.message(0)])
     drive(graph, world, 160, 175)
     (verdict,) = [v for v in graph.graph.closures() if v.closure.match_stamp_ns == world.message(0).match_stamp_ns]
     assert (verdict.state.value, verdict.reason) == ("refused", "no odometry at its keyframes: it began later")
@@ -206,7 +205,7 @@ def test_ending_a_graph_keeps_a_journal_that_somebody_reads(world: GraphWorld, t
     reader = sqlite3.connect(tmp_path / JOURNAL)
     reader.execute("BEGIN")
     reader.execute("SELECT count(*) FROM event").fetchone()  # its log cannot be written back now
-    graph.take_odometry(231 * PERIOD_NS, world.odometry[230])
+    graph.take([OdometrySample(231 * PERIOD_NS, world.odometry[230])])
     kept = graph.end()
     graph.close()
     reader.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import exp, log
 from pathlib import Path
@@ -25,10 +26,11 @@ from umf_ros.core.geometry import (
     near,
     propagate,
     relative,
+    ros_to_gtsam_covariance,
 )
 from umf_ros.core.odometry_noise import OdometryNoise
 from umf_ros.core.trajectory import Trajectory, write_tum
-from umf_ros.pose_graph.backend import PoseGraph
+from umf_ros.pose_graph.backend import MAX_WAITING, Key, PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State, check_closure, check_pose
 
 ACCEPTED_ODDS = log(0.999 / 0.001)
@@ -119,6 +121,7 @@ class Localizer(PoseGraph):
         """Delete all hypotheses: the odometry restarts at any place."""
         self._samples: deque[_Sample] = deque(maxlen=_KEPT_MESSAGES)
         self._early: deque[LoopClosure] = deque(maxlen=50)
+        self._received: dict[Key, None] = {}
         self._hypotheses: list[_PoseHypothesis] = []
         self._accepted: _PoseHypothesis | None = None
 
@@ -137,7 +140,7 @@ class Localizer(PoseGraph):
             path_m = last.path_m + float(self._noise.path_lengths(last.pose[None], odom_T_body[None], np.zeros(1))[0])
         self._samples.append(_Sample(stamp_ns, np.asarray(odom_T_body, float), path_m))
         for _ in range(len(self._early)):
-            decided = self.add_closure(self._early.popleft())
+            decided = self._add(self._early.popleft())
             self._decided += [verdict for verdict in decided if verdict.reason is not ClosureReason.NO_ODOMETRY_YET]
         found = self.estimate()
         if found is not None:
@@ -150,8 +153,23 @@ class Localizer(PoseGraph):
         """Count a measurement; the map stays unchanged."""
         self.counts["absolute measurements unused"] += 1
 
-    def add_closure(self, closure: LoopClosure) -> list[ClosureVerdict]:
-        """Add a closure with a keyframe of the map; return its verdict."""
+    def receive(self, closures: Sequence[LoopClosure]) -> list[ClosureVerdict]:
+        """Add closures with keyframes of the map; return the verdicts of new ones, repeated ones are counted only."""
+        verdicts: list[ClosureVerdict] = []
+        for closure in closures:
+            key = *closure.pair, closure.match_T_query.tobytes()
+            verdicts += [] if key in self._received else self._add(closure)
+            self.counts["closure twice"] += key in self._received
+            self._received[key] = None
+            if len(self._received) > MAX_WAITING:
+                del self._received[next(iter(self._received))]
+        return verdicts
+
+    def decide(self, within_s: float = float("inf")) -> list[ClosureVerdict]:
+        """Return no verdicts: `receive` decides at once."""
+        return []
+
+    def _add(self, closure: LoopClosure) -> list[ClosureVerdict]:
         if self._samples and closure.query_stamp_ns > self._samples[-1].stamp_ns:
             self._early.append(closure)
             return [ClosureVerdict(closure, State.PENDING, ClosureReason.NO_ODOMETRY_YET)]
@@ -159,7 +177,7 @@ class Localizer(PoseGraph):
         self.reasons[reason] += 1
         return [ClosureVerdict(closure, _STATES[reason], reason)]
 
-    def update(self, exactly: bool = True) -> list[ClosureVerdict]:
+    def update(self, exactly: bool = True, within_s: float = float("inf")) -> list[ClosureVerdict]:
         """Return the verdicts on closures whose odometry has arrived since the last call."""
         decided, self._decided = self._decided, []
         return decided
@@ -202,6 +220,10 @@ class Localizer(PoseGraph):
         """Raise a `GraphError`: there is nothing to decide about."""
         raise GraphError("localisation in a fixed map keeps no closures to decide about")
 
+    def add_by_hand(self, closure: LoopClosure) -> list[ClosureVerdict]:
+        """Raise a `GraphError`: the evidence alone decides where the rover is."""
+        return self.decide_by_hand(*closure.pair, State.ACCEPTED)
+
     def write_results(self, folder: Path, within_s: float = float("inf")) -> bool:
         """Write the trajectory, `trajectory_in_map.tum`; return true, as there is nothing to settle."""
         with writing(f"to {folder}"):
@@ -213,12 +235,13 @@ class Localizer(PoseGraph):
         """Compare the pose by a closure with every hypothesis, and add one if none agrees."""
         at, match = self._sample(closure.query_stamp_ns), self._map.get(closure.match_stamp_ns)
         try:
-            covariance = check_closure(closure, self._settings.max_closure_m) + np.diag(_MAP_SIGMAS**2)
+            check_closure(closure, self._settings.max_closure_m)
         except GraphError:
             at = None
         if at is None or match is None:
             return ClosureReason.NOT_OF_MAP
         pose = match @ closure.match_T_query
+        covariance = ros_to_gtsam_covariance(closure.covariance, closure.match_T_query) + np.diag(_MAP_SIGMAS**2)
         gain = trust = min(_logit(closure.probability), _MOST_PER_CLOSURE)
         agreed = [one for one in self._hypotheses if self._correct(one, at, pose, covariance)]
         for one in agreed:

@@ -26,8 +26,16 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from endurance_files import some_keyframe
-from endurance_graph import live_graph, long_graph, timed
-from endurance_live import fuzz_back_end, fuzz_front_end, kill_back_end, kill_front_end, play_live, two_robots
+from endurance_graph import backlogs, live_graph, long_graph, restart, timed
+from endurance_live import (
+    fuzz_back_end,
+    fuzz_front_end,
+    kill_back_end,
+    kill_both,
+    kill_front_end,
+    play_live,
+    two_robots,
+)
 from rich.console import Console
 from rich.table import Table
 
@@ -41,7 +49,7 @@ from umf_ros.runs.run_file import NAME, RunFile
 Figures = dict[str, Any]
 KEYS = "kills lost_keyframes duplicate_closures backend_kills lost_verdicts fuzz_messages fuzz_bags fuzz_files"
 KEYS += " fuzz_crashes fuzz_uncounted rss_bytes_per_keyframe live_p50_ms live_p95_ms executor_stall_max_ms shutdown_s"
-KEYS += " event_ms_20k query_ms_100k"
+KEYS += " event_ms_20k query_ms_100k closures_without_verdict closures_twice restart_s_8h"
 OFTEN = "loop: {min_time_gap_s: 8.0, min_travel_m: 10.0}"
 """Loops are closed within seconds, so that a short recording has some."""
 LIGHT = (
@@ -168,6 +176,7 @@ PARTS = {
     "replay": Part(kill_replays, 4, 200, 8),
     "front_end": Part(lambda task, n, rng: kill_front_end(task.folder, n, task.bag, task.light, rng), 2, 40, 4),
     "back_end": Part(lambda task, n, rng: kill_back_end(task.folder, n, rng), 3, 40, 5),
+    "both": Part(lambda task, n, rng: kill_both(task.folder, n, task.bag, task.light, rng), 4, 40, 4),
     "wire_front": Part(lambda task, n, rng: fuzz_front_end(task.folder, n, task.light, rng), 120, 1000, 500),
     "wire_back": Part(lambda task, n, rng: fuzz_back_end(task.folder, n, rng), 120, 1000, 500),
     "robots": Part(lambda task, _, __: two_robots(task.folder, task.bag, task.light), 1, 1, 1),
@@ -177,6 +186,8 @@ PARTS = {
     "places": Part(lambda _, __, rng: many_places(rng), 1, 1, 1),
     "graph": Part(lambda _, __, ___: long_graph(), 1, 1, 1),
     "graph_live": Part(lambda task, _, __: live_graph(task.folder), 1, 1, 1),
+    "backlog": Part(lambda task, _, __: backlogs(task.folder), 1, 1, 1),
+    "restart": Part(lambda task, _, __: restart(task.folder), 1, 1, 1),
     "live": Part(lambda task, _, __: play_live(task.folder, task.live_bag, task.whole), 1, 1, 1),
 }
 

@@ -26,6 +26,7 @@ from umf_ros.networks.weights import load_weights
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import stored_identity, stored_sessions
 from umf_ros.sensors.calibration import load_calibration
+from umf_ros.sensors.decode import OdometrySample
 
 Rng = np.random.Generator
 Read = Callable[[Path], object]
@@ -174,10 +175,10 @@ def _write_stores(folder: Path, rng: Rng) -> None:
     graph = DurableGraph(settings, folder / "graph.sqlite", lambda _: None)
     world = rover_loops(250, 10005)
     for k, pose in enumerate(world.odometry):
-        graph.take_odometry((k + 1) * PERIOD_NS, pose)
+        graph.take([OdometrySample((k + 1) * PERIOD_NS, pose)])
         for row, closure in enumerate(world.closures):
             if closure.second == k:
-                graph.add_closure(world.message(row))
+                graph.take([world.message(row)])
     graph.graph.write_g2o(folder / "graph.g2o")
     graph.close()
 
@@ -198,7 +199,7 @@ def _read_graph(path: Path) -> None:
     settings = load_settings().pose_graph.model_copy(update={"max_gap_s": 3.0})
     graph = DurableGraph(settings, path, lambda _: None)
     try:
-        graph.take_odometry(10**15, np.eye(4))
+        graph.take([OdometrySample(10**15, np.eye(4))])
         graph.write_results(path.parent)
     finally:
         graph.close()

@@ -6,19 +6,21 @@ import sqlite3
 import time
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from endurance_live import MANY
+from endurance_live import DISCOVERY_S, MANY
 from endurance_nodes import BACK_END, Ears, NodeUnderTest, own_domain
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
 
 from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.config import load_settings
-from umf_ros.core.geometry import Array, from_enu
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array, expmap, from_enu
 from umf_ros.core.io import memory_mb
 from umf_ros.durable_graph import DurableGraph
 from umf_ros.graph_process import JOURNAL
@@ -26,6 +28,7 @@ from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loop
 from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, to_pose, to_time
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason, State
+from umf_ros.sensors.decode import OdometrySample
 
 Figures = dict[str, Any]
 SEED = 10005
@@ -199,6 +202,96 @@ def long_graph(poses: int = 20_000) -> Figures:
 def live_graph(folder: Path, poses: int = 20_000) -> Figures:
     """The same events in the node."""
     return live(poses, folder) | saved(poses, folder)
+
+
+FAR_NS = 10**15
+"""Stamps of closures that never get odometry begin here."""
+
+
+def backlogs(folder: Path, number: int = 10_000, latched: int = 5000) -> Figures:
+    """Seconds to the next decision and of Ctrl-C after closures that wait, contradict, repeat, or came before it.
+
+    A kind of closure is sent to a back-end that knows the odometry, then one right closure; the latched ones are sent
+    before the back-end starts.
+    """
+    world, rng = rover_loops(500, SEED), np.random.default_rng(1)
+    right = [_later(world, row) for row in range(len(world.closures))]
+    alike = [replace(right[0], match_stamp_ns=FAR_NS + k, query_stamp_ns=FAR_NS + 10**11 + k) for k in range(number)]
+    ends = np.sort(rng.integers(1, 500, (number, 2)), axis=1) * PERIOD_NS
+    pairs = zip(alike, ends.tolist(), strict=True)
+    wrong = [replace(one, match_stamp_ns=match, query_stamp_ns=query) for one, (match, query) in pairs]
+    kinds = {
+        "waiting": alike,
+        "contradicting": [one for one in wrong if one.query_stamp_ns > one.match_stamp_ns],
+        "repeated": [right[1]] * number,
+        "refused": [replace(one, covariance=np.zeros((6, 6))) for one in alike],
+        "latched": alike[:latched],
+    }
+    figures: Figures = {"fuzz_crashes": 0}
+    for name, closures in kinds.items():
+        found = _backlog(folder / f"backlog_{name}", world, closures, right[-1], name == "latched")
+        figures["fuzz_crashes"] += found.pop("fuzz_crashes")
+        figures |= {f"{key}_{name}_s" if key != "lines" else f"lines_{name}": value for key, value in found.items()}
+    return figures
+
+
+def _backlog(folder: Path, world: GraphWorld, closures: list[LoopClosure], right: LoopClosure, early: bool) -> Figures:
+    with own_domain():
+        ears = Ears()
+        odometry = ears.create_publisher(Odometry, "/odom", MANY)
+        sender = ears.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS)
+
+        def send() -> None:
+            for row, closure in enumerate(closures):
+                sender.publish(closure_to_message(closure))
+                if row % 20 == 0:
+                    ears.spin_once(0.005)
+
+        if early:
+            send()
+        node = NodeUnderTest(BACK_END, folder, {"pose_graph.max_gap_s": 3.0})
+        ears.anew(BACK_END)
+        ears.until(odometry.get_subscription_count)
+        ears.wait(DISCOVERY_S)
+        for k, pose in enumerate(world.odometry):
+            message = Odometry(child_frame_id="base_link")
+            message.header.stamp, message.header.frame_id = to_time((k + 1) * PERIOD_NS), "odom"
+            message.pose.pose = to_pose(pose)
+            odometry.publish(message)
+            ears.spin_once(0.002)
+        ears.until(lambda: ears.value(BACK_END, "pose graph", "odometry") >= len(world.odometry) - 5, 20.0)
+        if not early:
+            send()
+        sent_s = time.time()
+        sender.publish(closure_to_message(right))
+        ears.until(lambda: right.pair in ears.decided, 120.0)
+        decision_s = ears.decided.get(right.pair, float("inf")) - sent_s
+        shutdown_s, status = node.stop()
+        ears.destroy_node()
+    return {
+        "decision": round(decision_s, 2),
+        "sigint": round(shutdown_s, 2),
+        "lines": len(node.log.read_text(errors="replace").splitlines()),
+        "fuzz_crashes": int(status != 0) + node.tracebacks(),
+    }
+
+
+def restart(folder: Path, hours: float = 8.0, rate_hz: float = 25.0) -> Figures:
+    """Seconds of a restart after hours of odometry, by the clock on the wall and of CPU."""
+    path = folder / "hours.sqlite"
+    path.unlink(missing_ok=True)
+    graph, count = DurableGraph(SETTINGS, path, _ignore), int(hours * 3600 * rate_hz)
+    turns = 2 * np.pi * np.arange(count) / (600 * rate_hz)
+    poses = expmap(np.stack([*np.zeros((2, count)), turns, *np.zeros((3, count))], axis=1))
+    poses[:, 0, 3], poses[:, 1, 3] = 10 + 50 * np.sin(turns), 50 * (1 - np.cos(turns))
+    stamps = 10**9 + (np.arange(count) * 1e9 / rate_hz).astype(np.int64)
+    for first in range(0, count, 500):
+        rows = slice(first, first + 500)
+        graph.take([OdometrySample(*one) for one in zip(stamps[rows].tolist(), poses[rows], strict=True)])
+    graph.close()
+    wall_ms, cpu_ms = timed(lambda: DurableGraph(SETTINGS, path, _ignore).close())
+    size_mb = round(path.stat().st_size / 1e6)
+    return {"restart_s_8h": round(wall_ms / 1e3, 2), "restart_cpu_s_8h": round(cpu_ms / 1e3, 2), "log_mb_8h": size_mb}
 
 
 def _later(world: GraphWorld, row: int) -> Any:

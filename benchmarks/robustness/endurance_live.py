@@ -138,6 +138,59 @@ def kill_front_end(folder: Path, kills: int, bag: Path, config: Path, rng: np.ra
     }
 
 
+ORDERS = ((BACK_END,), (FRONT_END,), (BACK_END, FRONT_END), (FRONT_END, BACK_END))
+"""Nodes that are killed one after the other, before those that were killed start again."""
+
+
+def kill_both(folder: Path, kills: int, bag: Path, config: Path, rng: np.random.Generator) -> Figures:
+    """Kill front-end and back-end in every order while a recording is played, at last both, and start them again.
+
+    Every closure in the front-end's table needs a verdict then, and no closure may count twice.
+    """
+    results = _fresh(folder, "both")
+    parameters: dict[str, object] = {"database.path": results / "places.sqlite"}
+    crashes, nodes = 0, dict[str, NodeUnderTest]()
+    with own_domain():
+        ears, player = Ears(), play(bag, "--rate", "0.5")
+        for number in range(kills + 1):
+            for name in (FRONT_END, BACK_END):
+                if name not in nodes:
+                    nodes[name] = NodeUnderTest(name, results, parameters, config=config)
+                    crashes += not ears.anew(name)
+            enough = len(ears.closures) + 2
+            ears.until(lambda: len(ears.closures) >= enough or player.poll() is not None, 60.0)  # noqa: B023 (at once)
+            for name in ORDERS[number % len(ORDERS)] if number < kills else ():
+                ears.wait(float(rng.uniform(0.0, 2.0)))
+                crashes += not nodes[name].is_alive
+                nodes.pop(name).kill()
+                ears.wait(float(rng.uniform(1.0, 4.0)))
+        player.kill()
+        for node in nodes.values():
+            node.kill()
+        nodes = {name: NodeUnderTest(name, results, parameters, config=config) for name in (FRONT_END, BACK_END)}
+        crashes += sum(not ears.anew(name) for name in nodes)
+        ears.wait(3.0)
+        stopped = [node.stop() for node in nodes.values()]
+        ears.destroy_node()
+    crashes += sum(status != 0 for _, status in stopped) + sum(node.tracebacks() for node in nodes.values())
+    with closing(sqlite3.connect(results / JOURNAL)) as kept:
+        stored = Counter(kept.execute("SELECT first_ns, second_ns, data FROM event WHERE kind = 'closure'"))
+    found, decided = (_pairs(results / name) for name in ("closures.csv", "graph_verdicts.csv"))
+    return {
+        "kills": kills,
+        "closures": len(found),
+        "closures_without_verdict": len(found - decided),
+        "closures_twice": stored.total() - len(stored),
+        "fuzz_crashes": crashes,
+        "shutdown_s": round(max(seconds for seconds, _ in stopped), 2),
+    }
+
+
+def _pairs(path: Path) -> set[tuple[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return {(row["match_stamp_ns"], row["query_stamp_ns"]) for row in csv.DictReader(file)}
+
+
 def _stored_places(path: Path) -> set[int]:
     with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as connection:
         return {stamp for (stamp,) in connection.execute("SELECT stamp_ns FROM keyframe")}

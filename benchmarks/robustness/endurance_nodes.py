@@ -19,10 +19,12 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from umf_ros.nodes.conversions import CLOSURES_QOS, from_time
+from umf_ros.pose_graph.closures import ClosureReason
 
 FRONT_END, BACK_END = "loop_closure_node", "pose_graph_node"
 PLAYER = "umf_ros.lab.live.bag_player_node"
 START_S = 120.0
+UNDECIDED = ClosureReason.NO_ODOMETRY_YET, ClosureReason.NOT_DECIDED_YET
 
 
 @contextmanager
@@ -108,6 +110,7 @@ class Ears(Node):
         keyframes: stamps of the keyframes that were announced.
         closures: pairs of stamps on `loop_closures`, match and query.
         verdicts: seconds of the monotonic clock at the back-end's first verdict on each of these.
+        decided: seconds of the system's clock at which those of them were compared with the map, or refused.
         values: latest diagnostics by node's full name, then by line.
     """
 
@@ -118,6 +121,7 @@ class Ears(Node):
         self.keyframes: set[int] = set()
         self.closures: set[tuple[int, int]] = set()
         self.verdicts: dict[tuple[int, int], float] = {}
+        self.decided: dict[tuple[int, int], float] = {}
         self.values: dict[str, dict[str, dict[str, str]]] = {}
         at = f"/{namespace}/" if namespace else "/"
         self.create_subscription(PoseStamped, f"{at}{FRONT_END}/keyframes", self._hear_keyframe, CLOSURES_QOS)
@@ -166,6 +170,8 @@ class Ears(Node):
         for status in message.status:
             match, _, query = status.name.partition(" ")
             self.verdicts.setdefault((_stamp(match), _stamp(query)), time.monotonic())
+            if status.message not in UNDECIDED:
+                self.decided.setdefault((_stamp(match), _stamp(query)), from_time(message.header.stamp) / 1e9)
 
     def _hear_health(self, message: DiagnosticArray) -> None:
         for status in message.status:

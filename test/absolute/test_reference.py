@@ -21,6 +21,7 @@ from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, AbsoluteWorld, open_gr
 from umf_ros.pose_graph import backend
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.runs.run_file import read_absolute_verdicts
+from umf_ros.sensors.decode import OdometrySample
 
 WORLD = open_ground(10_000, 500.0)
 ORIGIN = " ".join(map(str, WORLD.origin))
@@ -198,9 +199,9 @@ def test_a_restart_knows_all_measurements(tmp_path: Path) -> None:
     faults: list[Exception] = []
     durable, waiting = DurableGraph(settings, tmp_path / JOURNAL, faults.append), of(Aid.GNSS)
     for k, pose in enumerate(WORLD.graph.odometry[:150]):
-        durable.take_odometry(k * PERIOD_NS, pose)
+        durable.take([OdometrySample(k * PERIOD_NS, pose)])
         while waiting and waiting[0].stamp_ns <= k * PERIOD_NS:
-            durable.take_absolute(waiting.pop(0))
+            durable.take([waiting.pop(0)])
         durable.update()
     before = durable.graph.reference.report()
     durable.close()

@@ -44,7 +44,8 @@ TOPICS: dict[str, tuple[type, Any]] = {
 QUERY_NS = 1_667_000_100_123_456_789
 MATCH_NS = 1_667_000_000_000_000_001
 POSE = make_pose(Rotation.from_euler("zyx", [20, -3, 5], degrees=True).as_matrix(), [1.5, -0.75, 0.25])
-COVARIANCE = np.arange(36.0).reshape(6, 6) + 100 * np.eye(6)
+UPPER = np.triu(np.arange(36.0).reshape(6, 6))
+COVARIANCE = UPPER + UPPER.T + 100 * np.eye(6)
 
 
 class Talk:
@@ -105,7 +106,7 @@ def detection(verdicts: list[Hypothesis], keyframe: Keyframe | None = None) -> D
 
 
 def test_a_closure_goes_out_as_it_is_documented(talk: Talk) -> None:
-    talk.announcer.publish_closures(detection([accepted()]))
+    talk.announcer.publish_closures(detection([accepted()]).closures)
     (message,) = talk.hear("/loop_closures")
     assert message.header.frame_id == f"keyframe/{MATCH_NS}" and message.child_frame_id == f"keyframe/{QUERY_NS}"
     assert from_time(message.header.stamp) == QUERY_NS
@@ -135,11 +136,11 @@ def test_a_closure_with_another_rover_names_both(talk: Talk) -> None:
 
 def test_what_was_rejected_is_reported_and_never_published_as_a_closure(talk: Talk) -> None:
     without = detection([rejected(7), rejected(8, RejectReason.TURNED)])
-    talk.announcer.publish_closures(without)
+    talk.announcer.publish_closures(without.closures)
     talk.announcer.announce(without, {})
     (report,) = talk.hear("/front_end/candidates")
     assert [status.message for status in report.status] == [RejectReason.NO_POSE.value, RejectReason.TURNED.value]
-    talk.announcer.publish_closures(detection([accepted()]))
+    talk.announcer.publish_closures(detection([accepted()]).closures)
     talk.hear("/loop_closures")
     assert len(talk.heard["/loop_closures"]) == 1
 
@@ -237,7 +238,7 @@ def test_quality_of_service_is_as_documented(talk: Talk, topic: str, durability:
 
 def test_a_burst_of_closures_arrives_whole_and_in_order(talk: Talk) -> None:
     for number in range(1, 81):
-        talk.announcer.publish_closures(detection([accepted(number)]))
+        talk.announcer.publish_closures(detection([accepted(number)]).closures)
     heard = talk.hear("/loop_closures", 80)
     assert [message.header.frame_id for message in heard] == [f"keyframe/{number}" for number in range(1, 81)]
 
@@ -249,7 +250,7 @@ def test_a_best_effort_listener_hears_closures_too(talk: Talk) -> None:
     assert wait_until(lambda: talk.speaker.count_subscribers("/loop_closures") == 2, spin=talk.spin)
 
     def again() -> None:
-        talk.announcer.publish_closures(detection([accepted()]))
+        talk.announcer.publish_closures(detection([accepted()]).closures)
         talk.spin()
 
     assert wait_until(lambda: bool(heard), spin=again)
@@ -257,7 +258,7 @@ def test_a_best_effort_listener_hears_closures_too(talk: Talk) -> None:
 
 def test_who_joins_late_hears_every_closure(talk: Talk) -> None:
     for number in range(1, 151):
-        talk.announcer.publish_closures(detection([accepted(number)]))
+        talk.announcer.publish_closures(detection([accepted(number)]).closures)
     late: list[Odometry] = []
     talk.listener.create_subscription(Odometry, "/loop_closures", late.append, CLOSURES_QOS)
     assert wait_until(lambda: len(late) >= 150, spin=talk.spin)

@@ -232,9 +232,9 @@ class AbsoluteReference:
     def _place(self, paths: Sessions) -> bool:
         """Add measurements whose odometry has arrived to their tracks; return whether one is of a finished stretch."""
         waiting, placed, late = [], dict[tuple[int, Aid], list[AbsoluteMeasurement]](), False
-        for one in self._waiting:
-            session = paths.find(one.stamp_ns)
-            if session is None:
+        sessions = paths.find(np.array([one.stamp_ns for one in self._waiting], np.int64))
+        for one, session in zip(self._waiting, sessions.tolist(), strict=True):
+            if session < 0:
                 waiting.append(one)
                 continue
             placed.setdefault((session, one.source), []).append(one)

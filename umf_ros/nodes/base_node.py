@@ -41,8 +41,12 @@ from umf_ros.sensors.topic_finder import FRONT_END, SETTLING_S, TopicFinder, des
 STATIC_QOS = latched(100)
 """Deep enough for several broadcasters, each with a part of the tree."""
 ODOMETRY_DEPTH = 200
+BURST = 500
+"""Messages of a rare input that are received at once."""
 WATCH_S = 1.0
 HEARTBEAT_S = 0.05
+FAULT_S = 10.0
+"""Time after a fault until it leaves the status of the node."""
 CLOCK_PATIENCE_S = 30.0
 """Longest start of a bag player beside the nodes, for which it waits, on a busy machine."""
 SIM_TIME_SILENT = "use_sim_time is set, but /clock is silent: message stamps are used, the age of the pose is unknown"
@@ -74,7 +78,7 @@ class BaseNode(LifecycleNode, ABC):
         self.failure: UmfError | None = None
         self._watches: list[InputWatch] = []
         self._own: list[Any] = []
-        self._faults, self._last_fault = Counter[str](), ""
+        self._faults, self._last_fault, self._fault_s = Counter[str](), "", -math.inf
         self._logged_s: dict[str, float] = {}
         self._clockless_s = 0.0
         self._active = self._opened = self._leaving = False
@@ -297,8 +301,18 @@ class BaseNode(LifecycleNode, ABC):
         def lose(event: Any) -> None:
             watch.lost += event.total_count_change
 
+        guarded = self._guarded(name, receive)
+
+        def receive_waiting(message: Any) -> None:
+            """Receive a message and, of a rare input, those behind it: the executor takes a millisecond for each."""
+            guarded(message)
+            for _ in range(BURST if rare else 0):
+                if (taken := subscription.handle.take_message(kind, False)) is None:
+                    break
+                guarded(taken[0])
+
         events = SubscriptionEventCallbacks(message_lost=lose)
-        subscription = self.create_subscription(kind, topic, self._guarded(name, receive), qos, event_callbacks=events)
+        subscription = self.create_subscription(kind, topic, receive_waiting, qos, event_callbacks=events)
         watch = InputWatch(self, name, subscription.topic_name, kind, rare)
         self._watches.append(watch)
 
@@ -376,7 +390,7 @@ class BaseNode(LifecycleNode, ABC):
     def _judge(self, own: DiagnosticStatus) -> DiagnosticStatus:
         """Return the node's own status, degraded by silent inputs and recent faults."""
         troubles = [watch.warning for watch in self._watches if watch.warning]
-        troubles += [f"last fault: {self._last_fault}"] if self._last_fault else []
+        troubles += [f"last fault: {self._last_fault}"] if self._last_fault and self._has_fault else []
         if troubles or not self._active:
             own.level = max(own.level, WARN)
             own.message = "; ".join([own.message, *troubles]) if self._active else "inactive"
@@ -386,6 +400,7 @@ class BaseNode(LifecycleNode, ABC):
         """Count a fault; log the first of each kind at once, later ones at a limited rate."""
         kind = error.kind if isinstance(error, MessageError) else type(error).__name__
         self._faults[kind] += 1
+        self._fault_s = time.monotonic()
         where = f"{what}: " if what else ""
         if isinstance(error, MessageError):
             if self._faults[kind] == 1:
@@ -397,8 +412,13 @@ class BaseNode(LifecycleNode, ABC):
             self.get_logger().error(f"{where}{kind}: {text} ({self._faults[kind]} so far); the node continues")
 
     @property
+    def _has_fault(self) -> bool:
+        """Whether a fault is so recent that it may not be over."""
+        return time.monotonic() - self._fault_s < FAULT_S
+
+    @property
     def _cannot_write(self) -> bool:
-        return self._faults["OutputError"] > 0 and "write" in self._last_fault
+        return self._has_fault and self._faults["OutputError"] > 0 and "write" in self._last_fault
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:

@@ -183,9 +183,9 @@ def closure_by_hand(text: str) -> tuple[str, LoopClosure | None]:
         pose = from_quaternion((x, y, z), turn)
         if len(numbers) != 9 or not (0 < sigma_m < math.inf and 0 < sigma_deg < math.inf):
             raise ValueError("expected x y z qx qy qz qw and two standard deviations, m and deg")
-    except ValueError as error:
+        covariance = np.diag([sigma_m**2] * 3 + [math.radians(sigma_deg) ** 2] * 3)
+    except (ValueError, OverflowError) as error:
         raise MessageError("add_closure", f"{' '.join(numbers)[:80]!r} is no pose: {error}") from None
-    covariance = np.diag([sigma_m**2] * 3 + [math.radians(sigma_deg) ** 2] * 3)
     return pair, LoopClosure(query, match, pose, covariance, math.nan)
 
 

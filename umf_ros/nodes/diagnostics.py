@@ -108,9 +108,10 @@ class InputWatch:
         return f"silent for {silent_s:.0f} s: {len(publishers)} publisher(s) on {self.topic}"
 
     def _others(self) -> list[str]:
-        """Return the topics of the same type that are published: the sensor may have another topic."""
+        """Return published topics that can be this input: of its type, no other input, closures only for closures."""
+        taken = {subscription.topic_name for subscription in self._node.subscriptions}
         names = [name for name, types in self._node.get_topic_names_and_types() if self._type in types]
-        fit = [name for name in names if name != self.topic and not is_own(name)]
+        fit = [name for name in names if name not in taken and is_own(name) == self._rare]
         return [name for name in fit if self._node.count_publishers(name)][:5]
 
 

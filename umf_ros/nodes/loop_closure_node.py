@@ -35,6 +35,7 @@ from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, MAX_LINES, SCAN_FIELDS
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
+from umf_ros.runs.run_file import as_stored
 from umf_ros.runs.writer import RunRecorder, count_drops, with_places
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
@@ -79,6 +80,7 @@ class LoopClosureNode(BaseNode):
         if self._recorder is not None:
             self._opening.callback(self._recorder.close)
         self._publisher = ClosurePublisher(self, settings.frames)
+        self._publisher.publish_closures([] if self._recorder is None else self._recorder.earlier_closures)
         self._lock = threading.Lock()
         self._paused = False
         self._wanted: Settings | None = None
@@ -144,7 +146,7 @@ class LoopClosureNode(BaseNode):
             wanted, self._wanted = self._wanted, None
             if wanted is not None:
                 self._detector.retune(wanted)
-            detection = self._detector.process(frame, self._publisher.publish_closures)
+            detection = self._detector.process(frame, lambda found: self._publisher.publish_closures(found.closures))
             # before the database drops them
             matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
         self._last = detection
@@ -246,10 +248,10 @@ class ClosurePublisher:
         self._accepted: deque[Array] = deque(maxlen=MAX_LINES)
         self._rejected: deque[Array] = deque(maxlen=MAX_LINES)
 
-    def publish_closures(self, detection: Detection) -> None:
-        """Publish the closures of one detection."""
-        for closure in detection.closures:
-            self._closures.publish(messages.closure_to_message(closure))
+    def publish_closures(self, closures: list[LoopClosure]) -> None:
+        """Publish closures as they are stored, so that a repeated one is equal."""
+        for closure in closures:
+            self._closures.publish(messages.closure_to_message(as_stored(closure)))
 
     def announce(self, detection: Detection, matches: dict[int, Keyframe]) -> None:
         """Publish the rest of one detection; `matches` are the matched keyframes by stamp, for the markers."""

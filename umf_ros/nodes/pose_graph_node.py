@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
@@ -33,6 +34,7 @@ from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, parse_pair
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.pose_graph.closures import ClosureVerdict, State
+from umf_ros.runs.run_file import GraphInput
 from umf_ros.sensors.calibration import Calibration, calibration_of
 from umf_ros.sensors.decode import OdometrySample, stamp_ns
 from umf_ros.sensors.sessions import ODOMETRY, SessionClock, StampedInput
@@ -41,10 +43,15 @@ from umf_ros.sensors.topic_finder import BACK_END
 if find_spec("gtsam") is None:  # before inputs are searched: the process of the graph imports it
     raise ModuleNotFoundError("gtsam is not installed", name="gtsam")
 # minutes of fast odometry: none is lost while the optimiser works
-QUEUE = 100_000
+INBOX = 100_000
+AT_ONCE, DECIDE_S = 500, 0.5
+"""Most messages that are passed to the graph, or statuses in a message, and the time to decide about closures."""
 FRONT_END = "loop_closure_node"
 SETTLE_S, PREPARE_S = 0.4, 0.2
 """Longest time to settle the graph at the end, and to prepare for it once per second."""
+END_S = 2.0
+"""Longest time to process messages at the end; what is left is stored for the next start."""
+LEFT, DROPPED = "the next start with this folder processes them", "without results_dir they are dropped"
 UNSETTLED = "no time to settle the graph: its current results were written; the next start with this folder settles it"
 DRAWING = 20.0
 """Least pause between publications of path and markers, as a multiple of their duration: long paths are large."""
@@ -72,15 +79,17 @@ class PoseGraphNode(BaseNode):
         # newest odometry in path and markers; None: verdicts have changed since
         self._drawn_ns: int | None = None
         self._next_draw_s = 0.0
-        # each counted by one thread
-        self._closures_taken = self._closures_decided = 0
+        # messages for the graph, with the session of odometry; refusals to be logged together
+        self._inbox: deque[tuple[GraphInput, int]] = deque()
+        self._inbox_dropped, self._ending = 0, False
+        self._refused: list[ClosureVerdict] = []
         self._make_publishers()
         if recovery := self._durable.recovery():
             self.get_logger().info(recovery)
             self._announce(self._durable.closures())
-        self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._on_failure, QUEUE)
+        self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._on_failure, AT_ONCE)
         if self._state.unsettled:
-            self._worker.submit(lambda: self._settle_previous(), needed=True)
+            self._worker.submit(self._settle_previous, needed=True)
         is_aided = bool(settings.absolute.gnss or settings.absolute.imu)
         calibration = calibration_of(settings) if is_aided else None
         self._odometry_frames = self._subscribe_odometry(self._on_odometry, calibration)
@@ -99,8 +108,13 @@ class PoseGraphNode(BaseNode):
 
     def _finish(self) -> None:
         """Process the queue, settle the graph and write the results."""
-        self._worker.close(timeout_s=60.0)
+        self._ending = True
+        self._worker.close(END_S)
+        self._tell_refusals()
         try:
+            if left := [item for item, _ in self._inbox]:
+                self._durable.keep(left)
+                self.get_logger().warning(f"no time for {len(left)} messages: {LEFT if self._results else DROPPED}")
             if self._results and not self._durable.write_results(Path(self._results), SETTLE_S):
                 self.get_logger().warning(UNSETTLED)
         finally:
@@ -116,10 +130,13 @@ class PoseGraphNode(BaseNode):
         return not self._front_end_busy and now_s - self._interrupted_s > GRACE_S
 
     def _settle_previous(self) -> None:
-        """Settle the graph of the previous process."""
+        """Settle the graph of the previous process, in steps."""
         with watchdog.task("settling the graph", watchdog.PATIENT_S):
-            self._durable.write_results(Path(self._results))
-        self._announce(self._durable.closures())
+            settled = self._durable.write_results(Path(self._results), DECIDE_S)
+        if settled:
+            self._announce(self._durable.closures())
+        elif not self._ending:
+            self._worker.submit(self._settle_previous, needed=True)
 
     def _on_failure(self, error: Exception) -> None:
         """End the node when the process of the graph has ended."""
@@ -147,7 +164,7 @@ class PoseGraphNode(BaseNode):
     def _on_absolute(self, source: Aid, message: Any) -> None:
         measurement = self._decoder.decode(source, message, stamp_ns(message))
         if measurement is not None:
-            self._worker.submit(lambda: self._durable.take_absolute(measurement))
+            self._submit(measurement)
 
     def _make_publishers(self) -> None:
         self._path_publisher = self.create_publisher(PathMessage, "~/path", LATCHED_QOS)
@@ -162,7 +179,7 @@ class PoseGraphNode(BaseNode):
             self._frames = self._frames.model_copy(update={"odom": self._odometry_frames.odom})
         decided = self._odometry_clock.take(StampedInput(ODOMETRY, sample.stamp_ns, sample.odom_T_body))[1]
         session = self._odometry_clock.session
-        self._worker.submit(lambda: self._add_odometry(sample, session))
+        self._submit(sample, session)
         # the latest correction, if it is of this odometry: the pose never waits for the optimiser
         state = self._state
         map_T_odom = state.map_T_odom
@@ -178,43 +195,58 @@ class PoseGraphNode(BaseNode):
     def _on_closure(self, message: Odometry) -> None:
         if messages.is_between_rovers(message):
             return
-        closure = messages.closure_from_message(message)
-        self._closures_taken += self._worker.submit(lambda: self._add_closure(closure), needed=True)
+        self._submit(messages.closure_from_message(message))
 
-    def _add_closure(self, closure: LoopClosure) -> None:
-        self._closures_decided += 1
-        self._announce(self._durable.add_closure(closure))
+    def _submit(self, item: GraphInput, session: int = -1) -> None:
+        """Queue an input of the graph, of a session of odometry."""
+        if len(self._inbox) >= INBOX:
+            self._inbox_dropped += 1
+            return
+        self._inbox.append((item, session))
+        self._worker.submit(self._take, needed=True, once=True)
+
+    def _take(self) -> None:
+        """Pass queued inputs to the graph, and go on deciding; the odometry's correction is that of its session."""
+        batch = [self._inbox.popleft() for _ in range(min(len(self._inbox), AT_ONCE))]
+        verdicts, resets = self._durable.take([item for item, _ in batch], DECIDE_S)
+        for reset in resets:
+            self.get_logger().warning(f"{reset.reason}: a new session begins")
+        session = max([self._corrected, *(session for _, session in batch)])
+        if resets or session != self._corrected:
+            self._correct()
+            self._corrected = session
+        self._announce(verdicts)
+        if (self._inbox or self._is_behind) and not self._ending:
+            self._worker.submit(self._take, needed=True, once=True)
 
     @property
-    def _closures_waiting(self) -> int:
-        """Closures in the worker's queue; they precede all work that can wait."""
-        return self._closures_taken - self._closures_decided
+    def _is_behind(self) -> bool:
+        """Whether closures wait for a decision; they precede all work that can wait."""
+        waiting = any(isinstance(item, LoopClosure) for item, _ in tuple(self._inbox))
+        return waiting or bool(self._state.counts["closures_undecided"])
 
     def _on_reject(self, message: String) -> None:
         pair = parse_pair(message.data)
         self._worker.submit(lambda: self._announce(self._durable.decide_by_hand(*pair, State.REJECTED)), needed=True)
 
-    def _add_odometry(self, sample: OdometrySample, session: int) -> None:
-        reset = self._durable.take_odometry(sample.stamp_ns, sample.odom_T_body)
-        if reset is not None:
-            self.get_logger().warning(f"{reset.reason}: a new session begins")
-        if reset is not None or session != self._corrected:
-            self._correct()
-            self._corrected = session
-
     def _announce(self, verdicts: list[ClosureVerdict]) -> None:
         if not verdicts:
             return
         self._correct()
-        for verdict in verdicts:
-            # a verdict may change until the graph is settled, except a refusal
-            final = verdict.state is State.REFUSED
-            log = self.get_logger().info if final else self.get_logger().debug
-            log(describe(verdict))
-        report = DiagnosticArray(status=[_as_status(verdict) for verdict in verdicts])
-        report.header.stamp = self.get_clock().now().to_msg()
-        self._verdict_publisher.publish(report)
+        # a verdict may change until the graph is settled, except a refusal
+        self._refused += [verdict for verdict in verdicts if verdict.state is State.REFUSED]
+        for first in range(0, len(verdicts), AT_ONCE):
+            report = DiagnosticArray(status=[_as_status(one) for one in verdicts[first : first + AT_ONCE]])
+            report.header.stamp = self.get_clock().now().to_msg()
+            self._verdict_publisher.publish(report)
         self._drawn_ns = None
+
+    def _tell_refusals(self) -> None:
+        """Log refusals, those of one reason in one line."""
+        refused, self._refused = self._refused, []
+        for reason, number in Counter(verdict.reason for verdict in refused).items():
+            first = describe(next(verdict for verdict in refused if verdict.reason is reason))
+            self.get_logger().info(first if number == 1 else f"graph: {number} closures refused: {reason}")
 
     def _correct(self) -> None:
         self._state = self._durable.state()
@@ -237,18 +269,19 @@ class PoseGraphNode(BaseNode):
 
     def _update(self) -> None:
         """Decide about closures whose odometry has arrived, and publish the new path."""
-        self._announce(self._durable.update(exactly=not self._closures_waiting))
-        if not self._closures_waiting:
+        self._announce(self._durable.update(not self._is_behind, DECIDE_S))
+        self._tell_refusals()
+        if not self._is_behind:
             self._durable.prepare(PREPARE_S)
         self._correct()
         self._show()
 
     def _own_status(self) -> DiagnosticStatus:
         state = self._state
-        values: dict[str, object] = {**state.counts, **self._faults, "queue_dropped": self._worker.dropped}
-        values["queue_waiting"] = self._worker.waiting
+        values: dict[str, object] = {**state.counts, **self._faults, "queue_dropped": self._inbox_dropped}
+        values["queue_waiting"] = len(self._inbox)
         values["executor_stall_max_ms"] = self._stall_ms
-        trouble = self._worker.dropped or any(name.startswith("optimiser") for name in state.counts)
+        trouble = self._inbox_dropped or any(name.startswith("optimiser") for name in state.counts)
         trouble = trouble or any("as a whole" in name for name in state.counts)
         text = f"{values.get('accepted', 0)} closures accepted"
         if state.probability is not None:
@@ -256,7 +289,7 @@ class PoseGraphNode(BaseNode):
             text = "in the map" if state.map_T_odom is not None else "not localised in the map yet"
         if values.get("pending") and state.newest_ns < 0:
             trouble, text = True, f"{values['pending']} closures pending: no odometry received"
-        level = ERROR if self._cannot_write else WARN if trouble or self._faults else OK
+        level = ERROR if self._cannot_write else WARN if trouble or self._has_fault else OK
         return status(level, "pose graph", text, values)
 
     def _reject_last(self) -> str:
@@ -270,14 +303,14 @@ class PoseGraphNode(BaseNode):
         """Decide about the closures between two keyframes that the request's text names."""
         pair = parse_pair(request.load_namespace)
         self._announce(self._durable.decide_by_hand(*pair, state))
-        told = [one for one in self._durable.closures() if one.closure.pair == pair]
+        told = self._durable.verdicts_on(*pair)
         return "; ".join(f"closure {_name(one.closure)} {one.state.value}: {one.reason}" for one in told)
 
     def _add_by_hand(self, request: AddDiagnostics.Request) -> str:
         """Accept the closures between two keyframes; with a pose in the request, that is a new one."""
         pair, closure = messages.closure_by_hand(request.load_namespace)
         if closure is not None:
-            self._announce(self._durable.add_closure(closure))
+            self._announce(self._durable.add_by_hand(closure))
         return self._decide_by_hand(AddDiagnostics.Request(load_namespace=pair), State.ACCEPTED)
 
     def _save(self) -> str:

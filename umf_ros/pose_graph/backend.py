@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import takewhile, zip_longest
 from pathlib import Path
 
@@ -33,12 +33,19 @@ from umf_ros.pose_graph.closures import (
     verdict_rows,
 )
 from umf_ros.pose_graph.consistency import NoiseScale
-from umf_ros.pose_graph.odometry import POINT, PathPoints, Stamps
+from umf_ros.pose_graph.odometry import POINT, PathPoints, Rows, Stamps
 from umf_ros.pose_graph.rejection import OutlierRejection
 from umf_ros.pose_graph.sessions import Sessions
 from umf_ros.pose_graph.solver import Graph
 
 logger = logging.getLogger(__name__)
+
+MAX_WAITING = 10_000
+"""Most closures that wait for their odometry, and most refused ones that are kept: twice the history of the topic."""
+_AT_ONCE = 20
+_UNDECIDED = (ClosureReason.NO_ODOMETRY_YET, ClosureReason.DECIDED_BEFORE_ODOMETRY, ClosureReason.NOT_DECIDED_YET)
+Key = tuple[int, int, bytes]
+"""Stamps of match and query, and pose: an equal closure is a repeated message, another pose another measurement."""
 
 
 class PoseGraph:
@@ -54,11 +61,14 @@ class PoseGraph:
         self._rejection = OutlierRejection(self._settings, self._sessions)
         # decisions in order of stamps so far, and the sessions with odometry that they are based on
         self._ordered: tuple[list[int], Sessions, OutlierRejection] | None = None
-        self._waiting: list[tuple[LoopClosure, tuple[int, int] | None]] = []  # with session and stamp since when
-        self._held: list[PlacedClosure] = []
+        # without odometry, with session and stamp since when; with odometry, but without a decision; unusable
+        self._waiting: dict[Key, tuple[LoopClosure, tuple[int, int] | None]] = {}
+        self._arrived: list[PlacedClosure] = []
+        self._refused: dict[Key, ClosureVerdict] = {}
+        self._number_refused = 0
+        self._by_hand: dict[tuple[int, int], State] = {}  # decisions about closures that wait
         self._settled = False
-        self._placed: set[tuple[int, int, int, int, bytes]] = set()
-        self._refused: list[ClosureVerdict] = []
+        self._placed: set[tuple[int, int, Key]] = set()
         self.counts: Counter[str] = Counter()
 
     def retune(self, settings: PoseGraphSettings) -> None:
@@ -68,6 +78,7 @@ class PoseGraph:
 
     def begin_session(self) -> None:
         """Start a new odometry chain with its own gauge; later odometry belongs to it."""
+        self._place_waiting()  # a later session may have the same stamps
         self._sessions.begin()
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
@@ -88,6 +99,11 @@ class PoseGraph:
         self._sessions.chains[-1].add(int(stamp_ns), np.asarray(odom_T_body, float), covariance)
         return True
 
+    def load_odometry(self, stamps: Stamps, poses: Array) -> None:
+        """Add N messages that were accepted before, (N,) and (N, 4, 4)."""
+        self.counts["odometry"] += len(stamps)
+        self._sessions.chains[-1].extend(stamps, poses)
+
     def add_absolute(self, measurement: AbsoluteMeasurement) -> None:
         """Add an absolute measurement, in any order; `update` decides about it."""
         self._settled = False
@@ -98,52 +114,78 @@ class PoseGraph:
         return self.add_closures([closure])
 
     def add_closures(self, closures: list[LoopClosure]) -> list[ClosureVerdict]:
-        """Add several closures with a single, rough optimisation; see `add_closure`."""
-        self._refresh()
-        refused = [verdict for closure in closures if (verdict := self._receive(closure))]
-        decided, known = self._decide(), {id(closure) for closure in closures}
-        return refused + [verdict for verdict in self._pending() if id(verdict.closure) in known] + decided
+        """Add several closures; see `add_closure`."""
+        received, decided = self.receive(closures), self.decide()
+        known = {id(verdict.closure) for verdict in decided}
+        return [verdict for verdict in received if id(verdict.closure) not in known] + decided
 
-    def hold(self, closure: LoopClosure) -> None:
-        """Add a closure with an earlier verdict, which `resume` restores."""
-        self._refresh()
-        self._receive(closure)
-        self._held += self._take_waiting()[1]
+    def receive(self, closures: Sequence[LoopClosure]) -> list[ClosureVerdict]:
+        """Take closures for `decide`, at a constant cost each; return the first verdict of every new one.
 
-    def resume(self, verdicts: Mapping[tuple[int, int], Decision]) -> None:
-        """Restore the earlier verdicts of the held closures, by the stamps of match and query.
-
-        Closures without a verdict, and closures that share both stamps, are decided again.
+        Repeated ones are counted only.
         """
         self._refresh()
-        held, self._held = self._held + self._take_waiting()[1], []
-        times, decided, new = Counter(placed.closure.pair for placed in held), [], []
-        for placed in held:
+        stamps = np.array([closure.pair for closure in closures], np.int64).reshape(-1, 2)
+        both = zip(closures, *self._find(stamps), strict=True)
+        return [verdict for one in both if (verdict := self._receive(*one)) is not None]
+
+    def resume(self, verdicts: Mapping[tuple[int, int], Decision], within_s: float = float("inf")) -> None:
+        """Restore the earlier verdicts of received closures, by the stamps of match and query.
+
+        Closures without a verdict, and closures that share both stamps, are decided again; what is left when the time
+        is up, by the next calls of `decide`.
+        """
+        for key in [key for key in self._waiting if verdicts.get(key[:2], (None,))[0] is State.REFUSED]:
+            self._refuse(self._waiting.pop(key)[0], verdicts[key[:2]][1])
+        self._place_waiting()
+        self._refuse_waiting()
+        times, decided, new = Counter(placed.closure.pair for placed in self._arrived), [], []
+        for placed in self._arrived:
             pair = placed.closure.pair
             decision = verdicts.get(pair) if times[pair] == 1 else None
-            if decision is None or decision[0] is State.REFUSED or decision[1] is ClosureReason.NO_ODOMETRY_YET:
+            if decision is None or decision[0] is State.REFUSED or decision[1] in _UNDECIDED:
                 new.append(placed)
             else:
                 decided.append((placed, decision))
+        self._arrived = new
         if decided:
             self._attempt(lambda: self._rejection.resume(decided))
-        for placed in new:
-            self._attempt(lambda: self._rejection.consider([placed]))  # noqa: B023 (called at once)
+        self.decide(within_s)
         self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
 
-    def update(self, exactly: bool = True) -> list[ClosureVerdict]:
-        """Decide about measurements whose odometry has arrived, and solve the map exactly; return new verdicts."""
-        verdicts = self._decide()
+    def update(self, exactly: bool = True, within_s: float = float("inf")) -> list[ClosureVerdict]:
+        """Decide about measurements whose odometry has arrived, and solve the map exactly; return new verdicts.
+
+        When the time is up, closures are left, and the map is not solved exactly.
+        """
+        self._place_waiting()
+        verdicts = self._refuse_waiting() + self.decide(within_s)
         self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
-        if exactly:
+        if exactly and not self._arrived:
             self._attempt(self._rejection.refine)
         return verdicts
 
-    def _decide(self) -> list[ClosureVerdict]:
-        """Decide about closures whose odometry has arrived."""
+    def decide(self, within_s: float = float("inf")) -> list[ClosureVerdict]:
+        """Decide about received closures until the time is up, the oldest and the newest first; return new verdicts.
+
+        So a closure of now need not wait until a backlog is decided about.
+        """
         self._refresh()
-        refused, arrived = self._take_waiting()
-        return refused + self._attempt(lambda: self._rejection.consider(arrived))
+        verdicts, until_s, half = [], time.monotonic() + within_s, _AT_ONCE // 2
+        while True:
+            chosen = self._arrived[:half] + self._arrived[half:][-half:]
+            self._arrived = self._arrived[half:-half]
+            verdicts += self._attempt(lambda: self._rejection.consider(chosen))  # noqa: B023 (called at once)
+            for pair in {one.closure.pair for one in chosen} & self._by_hand.keys():
+                state = self._by_hand.pop(pair)
+                verdicts += self._attempt(lambda: self.decide_by_hand(*pair, state))  # noqa: B023 (called at once)
+            if not self._arrived or time.monotonic() > until_s:
+                return verdicts
+
+    @property
+    def undecided(self) -> int:
+        """Number of closures that `decide` had no time for."""
+        return len(self._arrived)
 
     def prepare(self, within_s: float) -> None:
         """Do part of the work of `settle` within a time limit; after a long mission it takes minutes."""
@@ -167,11 +209,12 @@ class PoseGraph:
         Returns:
             The changed verdicts; None when the time was up first, and nothing has changed.
         """
-        verdicts = self.update()
+        until_s = time.monotonic() + within_s
+        verdicts = self.update(within_s=within_s)
         if self._settled:  # no input since
             return verdicts
         before = self._rejection
-        if not self._reprocess(within_s) or self._ordered is None:
+        if self._arrived or not self._reprocess(until_s - time.monotonic()) or self._ordered is None:
             return None
         (_, self._sessions, self._rejection), self._ordered = self._ordered, None
         rows = {id(placed): row for row, placed in enumerate(self._rejection.placed)}
@@ -225,24 +268,72 @@ class PoseGraph:
     def decide_by_hand(self, match_stamp_ns: int, query_stamp_ns: int, state: State) -> list[ClosureVerdict]:
         """Accept or reject every closure between two keyframes whatever the evidence; pending takes that back.
 
+        It holds for closures that wait for their odometry, too.
+
         Raises:
             GraphError: there is no such closure, or the graph cannot be solved so; then nothing has changed.
         """
-        pairs = [placed.closure.pair for placed in self._rejection.placed]
-        rows = [row for row, pair in enumerate(pairs) if pair == (match_stamp_ns, query_stamp_ns)]
+        pair = match_stamp_ns, query_stamp_ns
+        if chosen := [placed for placed in self._arrived if placed.closure.pair == pair]:
+            self._arrived = [placed for placed in self._arrived if placed.closure.pair != pair]
+            self._attempt(lambda: self._rejection.consider(chosen))
+        rows = [row for row, placed in enumerate(self._rejection.placed) if placed.closure.pair == pair]
+        waiting = [verdict.closure for verdict in self._pending() if verdict.closure.pair == pair]
         self._settled = False
-        if not rows:
+        if not rows and not waiting:
             raise GraphError(f"no closure between keyframes {match_stamp_ns} and {query_stamp_ns}")
-        return [verdict for row in rows for verdict in self._rejection.decide_by_hand(row, state)]
+        if waiting:
+            self._by_hand[pair] = state
+        told = [ClosureVerdict(one, State.PENDING, self._reason_to_wait(pair)) for one in waiting]
+        return told + [verdict for row in rows for verdict in self._rejection.decide_by_hand(row, state)]
 
-    def _receive(self, closure: LoopClosure) -> ClosureVerdict | None:
-        """Queue a closure; return the verdict of an unusable one."""
+    def add_by_hand(self, closure: LoopClosure) -> list[ClosureVerdict]:
+        """Add a closure and accept it whatever the evidence, at once or when its odometry arrives.
+
+        Raises:
+            GraphError: it is unusable, or the graph cannot be solved with it; it is not kept as evidence.
+        """
+        check_closure(closure, self._settings.max_closure_m)
+        verdicts = self.add_closure(closure)
+        try:
+            return verdicts + self.decide_by_hand(*closure.pair, State.ACCEPTED)
+        except GraphError:
+            self.decide_by_hand(*closure.pair, State.REJECTED)
+            raise
+
+    def _find(self, stamps: Stamps) -> tuple[Rows, Rows]:
+        """Return the sessions (N,) of the matches and the queries of closures with (N, 2) stamps, -1 without one."""
+        queries = self._sessions.find(stamps[:, 1])
+        return self._sessions.find(stamps[:, 0], before=queries), queries
+
+    def _receive(self, closure: LoopClosure, match: int, query: int) -> ClosureVerdict | None:
+        """Queue a closure of two sessions; return its first verdict, None if it is known."""
+        key = *closure.pair, closure.match_T_query.tobytes()
+        before = self._refused.get(key)
         try:
             check_closure(closure, self._settings.max_closure_m)
         except GraphError as error:
-            return self._refuse(closure, error.args[0])
-        self._waiting.append((closure, self._now))
+            if before is None or before.reason is not error.args[0]:
+                return self._refuse(closure, error.args[0])
+        else:
+            is_placed = min(match, query) >= 0
+            if is_placed and self._place(key, PlacedClosure(match, query, closure)):
+                return ClosureVerdict(closure, State.PENDING, ClosureReason.NOT_DECIDED_YET)
+            if not is_placed and key not in self._waiting and before is None:
+                self._waiting[key] = closure, self._now
+                return ClosureVerdict(closure, State.PENDING, ClosureReason.NO_ODOMETRY_YET)
+        self.counts["closure twice"] += 1
         return None
+
+    def _place(self, key: Key, placed: PlacedClosure) -> bool:
+        """Queue a closure for its decision; return false if it is known in its sessions."""
+        if (placed.match, placed.query, key) in self._placed:
+            return False
+        self._placed.add((placed.match, placed.query, key))
+        self._arrived.append(placed)
+        self._number_refused -= self._refused.pop(key, None) is not None  # when it came before its odometry
+        self._settled = False
+        return True
 
     @property
     def _now(self) -> tuple[int, int] | None:
@@ -251,43 +342,54 @@ class PoseGraph:
 
     def _refuse(self, closure: LoopClosure, reason: ClosureReason) -> ClosureVerdict:
         self.counts[f"closure refused: {reason}"] += 1
-        self._refused.append(ClosureVerdict(closure, State.REFUSED, reason))
-        return self._refused[-1]
+        self._number_refused += 1
+        self._by_hand.pop(closure.pair, None)
+        verdict = ClosureVerdict(closure, State.REFUSED, reason)
+        self._refused[*closure.pair, closure.match_T_query.tobytes()] = verdict
+        if len(self._refused) > MAX_WAITING:
+            del self._refused[next(iter(self._refused))]
+        return verdict
 
-    def _take_waiting(self) -> tuple[list[ClosureVerdict], list[PlacedClosure]]:
-        """Return refusals of closures that were pending too long, and closures whose odometry has arrived."""
-        refused, arrived, waiting = [], [], []
+    def _place_waiting(self) -> None:
+        """Queue closures whose odometry has arrived for their decision."""
+        self._refresh()
+        sessions = self._find(np.array([key[:2] for key in self._waiting], np.int64).reshape(-1, 2))
+        for key, match, query in zip(list(self._waiting), *(found.tolist() for found in sessions), strict=True):
+            if min(match, query) >= 0:
+                placed = PlacedClosure(match, query, self._waiting.pop(key)[0])
+                self.counts["closure twice"] += not self._place(key, placed)
+
+    def _refuse_waiting(self) -> list[ClosureVerdict]:
+        """Return refusals of closures that wait for too long, and of the oldest ones when too many wait."""
         oldest_ns, now = min((span[0] for span in self.session_spans() if span), default=None), self._now
-        for closure, known in self._waiting:
+        waiting, self._waiting = self._waiting, {}
+        refused, too_many = list[ClosureVerdict](), len(waiting) - MAX_WAITING
+        for number, (key, (closure, known)) in enumerate(waiting.items()):
             since = known if known and now and known[0] == now[0] else now
             waited_s = 0.0 if now is None or since is None else (now[1] - since[1]) / 1e9
-            query = self._sessions.find(closure.query_stamp_ns)
-            match = self._sessions.find(closure.match_stamp_ns, before=query)
-            if query is not None and match is not None:
-                # two measurements of one pair are two closures; an equal one is a repeated latched message
-                key = match, query, *closure.pair, closure.match_T_query.tobytes()
-                if key in self._placed:
-                    self.counts["closure twice"] += 1
-                    continue
-                self._placed.add(key)
-                self._settled = False
-                arrived.append(PlacedClosure(match, query, closure))
-            elif waited_s > self._settings.max_gap_s and oldest_ns is not None and min(closure.pair) < oldest_ns:
+            if waited_s > self._settings.max_gap_s and oldest_ns is not None and min(closure.pair) < oldest_ns:
                 refused.append(self._refuse(closure, ClosureReason.BEFORE_ODOMETRY))
             elif waited_s > self._settings.max_pending_s:
                 refused.append(self._refuse(closure, ClosureReason.NO_ODOMETRY))
+            elif number < too_many:
+                refused.append(self._refuse(closure, ClosureReason.TOO_MANY_WAIT))
             else:
-                waiting.append((closure, since))
-        self._waiting = waiting
-        return refused, arrived
+                self._waiting[key] = closure, since
+        return refused
 
     def closures(self) -> list[ClosureVerdict]:
-        """Return the latest verdict of every closure, in order of arrival."""
-        return self._rejection.verdicts + self._pending() + self._refused
+        """Return the latest verdict of every closure, in order of arrival; of refused ones the newest."""
+        return self._rejection.verdicts + self._pending() + list(self._refused.values())
 
     def _pending(self) -> list[ClosureVerdict]:
-        """Return verdicts of closures whose odometry has not arrived."""
-        return [ClosureVerdict(one, State.PENDING, ClosureReason.NO_ODOMETRY_YET) for one, _ in self._waiting]
+        """Return verdicts of closures without a decision."""
+        undecided = [ClosureVerdict(one.closure, State.PENDING, ClosureReason.NOT_DECIDED_YET) for one in self._arrived]
+        waiting = (closure for closure, _ in self._waiting.values())
+        return undecided + [ClosureVerdict(one, State.PENDING, self._reason_to_wait(one.pair)) for one in waiting]
+
+    def _reason_to_wait(self, pair: tuple[int, int]) -> ClosureReason:
+        by_hand = self._by_hand.get(pair, State.PENDING) is not State.PENDING
+        return ClosureReason.DECIDED_BEFORE_ODOMETRY if by_hand else ClosureReason.NO_ODOMETRY_YET
 
     @property
     def scale(self) -> NoiseScale:
@@ -296,7 +398,9 @@ class PoseGraph:
 
     def verdict_counts(self) -> Counter[State]:
         """Return the number of closures by state."""
-        return Counter(verdict.state for verdict in self.closures())
+        pending, refused = len(self._arrived) + len(self._waiting), self._number_refused
+        known = {State.PENDING: pending, State.REFUSED: refused}
+        return Counter(verdict.state for verdict in self._rejection.verdicts) + Counter(known)
 
     def trajectory(self, optimized: bool = True) -> tuple[Stamps, Array]:
         """Return stamps (N,) in ns and `map_T_body` or `odom_T_body` (N, 4, 4) of every keyframe joined to the map."""
@@ -314,7 +418,7 @@ class PoseGraph:
         self._refresh()
         poses, known = np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps), bool)
         for chain in (self._sessions.chains[session] for session in self.sessions_of_map()):
-            covered = ~known & np.fromiter((chain.covers(stamp) for stamp in stamps.tolist()), bool, len(stamps))
+            covered = ~known & chain.covers(stamps)
             if covered.any():
                 poses[covered] = self._sessions.at(chain.at(stamps[covered]))
                 known |= covered

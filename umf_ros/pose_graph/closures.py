@@ -18,6 +18,7 @@ from umf_ros.pose_graph.odometry import POINT, OdometryChain
 VERDICT_COLUMNS = ("match_stamp_ns", "query_stamp_ns", "verdict", "reason", "mahalanobis", "misfit_m")
 """Columns of a table of verdicts."""
 _LARGEST_SKEW, _LARGEST_VARIANCE, _LARGEST_CONDITION = 1e-3, 1e15, 1e12  # measured: from 1e13 on Cholesky fails
+_SMALLEST_VARIANCE = 1e-15
 
 
 class ClosureReason(StrEnum):
@@ -28,6 +29,8 @@ class ClosureReason(StrEnum):
     UNOPPOSED = "nothing speaks against it"
     UNSURE = "needs support from another place"
     NO_ODOMETRY_YET = "its odometry has not arrived"
+    DECIDED_BEFORE_ODOMETRY = "decided by hand; its odometry has not arrived"
+    NOT_DECIDED_YET = "waits for its decision"
     CONTRADICTS = "contradicts the map"
     TOO_FAR = "moves the pose by more than max_correction_m"
     OUTVOTED = "revoked: more places contradict it"
@@ -39,6 +42,7 @@ class ClosureReason(StrEnum):
     NOT_OF_MAP = "its keyframe is not of the map, or no odometry is at the query"
     NO_ODOMETRY = "no odometry at its keyframes"
     BEFORE_ODOMETRY = "no odometry at its keyframes: it began later"
+    TOO_MANY_WAIT = "too many closures wait for their odometry"
     ITSELF = "a keyframe cannot close a loop with itself"
     TOO_LONG = "absurd translation: longer than max_closure_m"
     POSE_SHAPE = "pose is not a 4x4 matrix"
@@ -47,6 +51,7 @@ class ClosureReason(StrEnum):
     POSE_FAR = "absurd position: beyond 10,000 km"
     COVARIANCE_SHAPE = "covariance is not a 6x6 matrix"
     COVARIANCE_NOT_FINITE = "covariance is not finite"
+    COVARIANCE_RANGE = "absurd covariance: a variance above 1e15 or below 1e-15"
     COVARIANCE_ASYMMETRIC = "covariance is not symmetric"
     COVARIANCE_NOT_POSITIVE = "covariance is not positive definite"
 
@@ -113,18 +118,14 @@ def as_closures(placed: PlacedClosure, row: int, chains: Sequence[OdometryChain]
     return found
 
 
-def check_closure(closure: LoopClosure, max_length_m: float) -> Array:
-    """Return the (6, 6) covariance of a usable closure in GTSAM's order, tangent space of the query.
-
-    Raises a `GraphError` with a `ClosureReason`, as the other checks do.
-    """
+def check_closure(closure: LoopClosure, max_length_m: float) -> None:
+    """Refuse an unusable closure by a `GraphError` with a `ClosureReason`, as the other checks do."""
     if closure.query_stamp_ns == closure.match_stamp_ns:
         raise GraphError(ClosureReason.ITSELF)
     check_pose(closure.match_T_query)
     if float(np.linalg.norm(closure.match_T_query[:3, 3])) > max_length_m:
         raise GraphError(ClosureReason.TOO_LONG)
     check_covariance(closure.covariance)
-    return ros_to_gtsam_covariance(closure.covariance, closure.match_T_query)
 
 
 def check_pose(pose: Array) -> None:
@@ -145,9 +146,14 @@ def check_covariance(covariance: Array) -> None:
     if np.shape(covariance) != (6, 6):
         raise GraphError(ClosureReason.COVARIANCE_SHAPE)
     spread = np.abs(covariance).max()
-    if not spread < _LARGEST_VARIANCE:
+    if not np.isfinite(spread):
         raise GraphError(ClosureReason.COVARIANCE_NOT_FINITE)
+    if spread >= _LARGEST_VARIANCE:
+        raise GraphError(ClosureReason.COVARIANCE_RANGE)
     if np.abs(covariance - covariance.T).max() > 1e-6 * spread:
         raise GraphError(ClosureReason.COVARIANCE_ASYMMETRIC)
-    if np.linalg.eigvalsh(covariance).min() * _LARGEST_CONDITION <= spread:
+    smallest = np.linalg.eigvalsh(covariance).min()
+    if smallest * _LARGEST_CONDITION <= spread:
         raise GraphError(ClosureReason.COVARIANCE_NOT_POSITIVE)
+    if smallest < _SMALLEST_VARIANCE:
+        raise GraphError(ClosureReason.COVARIANCE_RANGE)

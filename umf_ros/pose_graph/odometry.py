@@ -51,7 +51,7 @@ class OdometryChain:
     def __init__(self, settings: PoseGraphSettings, session: int = 0) -> None:
         self._settings, self._session = settings, session
         self._noise = OdometryNoise.stated(settings)
-        self._arrived: list[tuple[int, Array]] = []
+        self._arrived: list[tuple[Stamps, Array]] = []
         self._covariances: dict[int, Array] = {}
         stamps, poses = np.empty(0, np.int64), np.empty((0, 4, 4))
         self._messages = Table(stamp=stamps, pose=poses)
@@ -80,9 +80,13 @@ class OdometryChain:
 
     def add(self, stamp_ns: int, pose: Array, covariance: Array | None = None) -> None:
         """Add a message; see `PoseGraph.add_odometry`."""
-        self._arrived.append((stamp_ns, pose))
+        self.extend(np.array([stamp_ns]), pose[None])
         if covariance is not None:
             self._covariances.setdefault(stamp_ns, covariance)
+
+    def extend(self, stamps: Stamps, poses: Array) -> None:
+        """Add N messages, (N,) and (N, 4, 4)."""
+        self._arrived.append((stamps, poses))
 
     def update(self) -> bool:
         """Process the new messages; return true if the past changed and not only the end grew."""
@@ -92,13 +96,14 @@ class OdometryChain:
         self._choose_keyframes(changed)
         return span is not None and changed < span[1]
 
-    def covers(self, stamp_ns: int) -> bool:
-        """Return whether a stamp is a message's own or lies in a gap that is short enough to interpolate."""
+    def covers(self, stamps: Stamps) -> NDArray[np.bool_]:
+        """Return (N,) whether a stamp is a message's own or lies in a gap that is short enough to interpolate."""
         known = self._messages["stamp"]
-        if not len(known) or not known[0] <= stamp_ns <= known[-1]:
-            return False
-        lower, upper, _ = bracket(known, np.array([stamp_ns]))
-        return bool(known[upper] - known[lower] <= self._settings.max_gap_s * 1e9)
+        if not len(known):
+            return np.zeros(len(stamps), bool)
+        lower, upper, _ = bracket(known, stamps)
+        is_inside = (known[0] <= stamps) & (stamps <= known[-1])
+        return is_inside & (known[upper] - known[lower] <= self._settings.max_gap_s * 1e9)
 
     def poses_at(self, stamps: Stamps) -> Array:
         """Return (N, 4, 4) odometry poses interpolated at the stamps, held constant outside the messages."""
@@ -130,8 +135,8 @@ class OdometryChain:
         """Sort the new messages in, the first of each stamp; return the earliest new stamp."""
         if not self._arrived:
             return None
-        stamps = np.array([stamp for stamp, _ in self._arrived], np.int64)
-        poses = orthonormal(np.stack([pose for _, pose in self._arrived]))
+        stamps = np.concatenate([stamps for stamps, _ in self._arrived], dtype=np.int64)
+        poses = orthonormal(np.concatenate([poses for _, poses in self._arrived]))
         poses[:, 3] = 0, 0, 0, 1
         self._arrived = []
         known = self._messages["stamp"]

@@ -80,10 +80,12 @@ class Sessions:
         """Sessions with odometry."""
         return [session for session, chain in enumerate(self.chains) if len(chain.stamps)]
 
-    def find(self, stamp_ns: int, before: int | None = None) -> int | None:
-        """Return the newest session (not newer than `before`) whose odometry covers the stamp, or None."""
-        newest = len(self.chains) - 1 if before is None else before
-        return next((session for session in range(newest, -1, -1) if self.chains[session].covers(stamp_ns)), None)
+    def find(self, stamps: Stamps, before: Rows | None = None) -> Rows:
+        """Return (N,) the newest session (not newer than (N,) `before`) whose odometry covers each stamp, or -1."""
+        found = np.full(len(stamps), -1)
+        for session, chain in enumerate(self.chains if len(stamps) else []):
+            found[chain.covers(stamps) & (before is None or session <= before)] = session
+        return found
 
     def members(self, component: int) -> list[int]:
         """Return sessions with odometry of one component, which has the number of its earliest session."""

@@ -264,6 +264,11 @@ def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:
     return [*closure.endpoints, *(f"{number:.9g}" for number in numbers), triangle]
 
 
+def as_stored(closure: LoopClosure) -> LoopClosure:
+    """Return a closure with the numbers of its row, which are rounded."""
+    return parse_closure(dict(zip(CLOSURES, closure_row(closure, float("nan")), strict=True)))
+
+
 def pose_numbers(pose: Array, covariance: Array) -> list[float]:
     """Return the values of `POSE` and `SIGMA` of a pose (4, 4) and its covariance (6, 6): roots of the diagonal."""
     return [*pose[:3, 3], *to_quaternion(pose), *np.sqrt(np.diag(covariance))]

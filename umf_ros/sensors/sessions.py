@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
@@ -116,6 +117,10 @@ class SessionClock:
             return None, dropped
         reset = self._held[agreeing[0]].reset
         return reset, dropped + self._believe(agreeing, reset)
+
+    def learn(self, known: StampedInput) -> None:
+        """Take a message that was in line before a restart."""
+        self._advance(known)
 
     @property
     def held(self) -> int:
@@ -357,3 +362,9 @@ class OdometrySessionSplitter:
                 continue
             self._graph.add_odometry(one.stamp_ns, one.value)  # late ones too: the graph sorts them in
             self.newest_ns = max(self.newest_ns, one.stamp_ns)
+
+    def learn(self, messages: Iterable[tuple[int, Array]]) -> None:
+        """Take messages that were passed on before a restart, and those of long ago not all."""
+        for stamp_ns, odom_T_body in messages:
+            self._clock.learn(StampedInput(ODOMETRY, stamp_ns, odom_T_body))
+            self.newest_ns = max(self.newest_ns, stamp_ns)
