@@ -173,6 +173,12 @@ def gtsam_to_ros_covariance(covariance: ArrayLike, pose: Array) -> Array:
     return turn @ np.roll(np.asarray(covariance, dtype=float).reshape(6, 6), 3, axis=(0, 1)) @ turn.T
 
 
+def quantize(points: NDArray[Any], unit_m: float) -> NDArray[np.int16]:
+    """Return points (N, 3) m as (M, 3) int16 in `unit_m`, without those that are not finite or do not fit."""
+    fits = (np.abs(points) <= np.iinfo(np.int16).max * unit_m).all(axis=1)  # false for NaN
+    return np.rint(points[fits] / unit_m).astype(np.int16)
+
+
 def evenly(count: int, most: int) -> NDArray[np.intp]:
     """Return all of `count` indices, or `most` of them evenly spread from the first to the last."""
     return np.linspace(0, count - 1, min(count, most)).astype(np.intp)
