@@ -12,6 +12,7 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from processes import Process, call_service, wait_until
+from rcl_interfaces.msg import Log
 from rclpy.node import Node
 from recordings import POINT
 from sensor_msgs.msg import Image, PointCloud2, PointField
@@ -174,6 +175,8 @@ def test_a_full_disk_shows_at_once_and_ends_nothing(rig: Rig, node: Process) -> 
 
 
 def test_a_clock_that_jumps_back_starts_a_new_session(rig: Rig, node: Process) -> None:
+    logged: list[Log] = []
+    rig.create_subscription(Log, "/rosout", logged.append, 100)
     for lap in range(2):
         for i in range(4):
             rig.publish_pair(START_NS + i * 213_000_000)
@@ -181,6 +184,13 @@ def test_a_clock_that_jumps_back_starts_a_new_session(rig: Rig, node: Process) -
     # the last scan of each lap waits for later stamps; the jump completes the first lap
     assert rig.until(lambda: rig.count("cloud_received") == 8)
     assert rig.until(lambda: 0 < rig.count("places") <= 4), node.output
+    for i in range(8):
+        rig.publish_pair(START_NS - 100 * 10**9 + i * 213_000_000)
+        rig.until(lambda i=i: rig.count("cloud_received") > 8 + i, 5.0)
+    # from the detector, which knows no ROS
+    assert rig.until(lambda: any("a new session begins; the" in one.msg for one in logged)), node.output
+    (line,) = [one for one in logged if "a new session begins; the" in one.msg]
+    assert (line.name, line.level) == ("loop_closure_node", Log.WARN) and line.stamp.sec
     assert node.exit_code is None
 
 

@@ -16,6 +16,7 @@ from typing import Generic, NoReturn, TypeVar
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
@@ -91,6 +92,33 @@ class Worker(Generic[Item]):
                     self._work(item)
             except Exception as error:
                 self._on_error(error)
+
+
+class _LogBridge(logging.Handler):
+    """Handler that passes records of Python's logging, warnings included, to the logger of a node."""
+
+    def __init__(self, logger: RcutilsLogger) -> None:
+        super().__init__()
+        self._logger = logger
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Pass a record on in one line; ROS wants a line of code for each level."""
+        text = " ".join(record.getMessage().split())
+        if record.levelno >= logging.ERROR:
+            self._logger.error(text)
+        elif record.levelno >= logging.WARNING:
+            self._logger.warning(text)
+        else:
+            self._logger.info(text)
+
+
+def log_to(logger: RcutilsLogger) -> None:
+    """Pass all that the process logs or warns of to the logger of its node, in place of that of an earlier node."""
+    logging.captureWarnings(True)
+    root = logging.getLogger()
+    for handler in [one for one in root.handlers if isinstance(one, _LogBridge)]:
+        root.removeHandler(handler)
+    root.addHandler(_LogBridge(logger))
 
 
 LONGEST_WAIT_S = 60.0
