@@ -6,7 +6,6 @@ import gc
 import time
 from collections import Counter
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace

@@ -33,7 +33,7 @@ from umf_ros.core.io import check_writable
 from umf_ros.nodes.conversions import from_time, latched, sensor_qos
 from umf_ros.nodes.diagnostics import WARN, InputWatch
 from umf_ros.nodes.parameters import changed_settings, declare
-from umf_ros.nodes.process import Worker, log_to
+from umf_ros.nodes.process import Worker, interruptible, log_to
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.tf import PATIENCE_S, TOPIC, BodyFrames, StaticTransforms
@@ -215,7 +215,8 @@ class BaseNode(LifecycleNode, ABC):
         before, self._unwritten = self._entities(), None
         try:
             with watchdog.watching(watchdog.PATIENT_S), ExitStack() as self._opening:
-                self._open()
+                with interruptible():
+                    self._open()
                 self._opening.pop_all()
             self._opened = True
             # permanent objects: their garbage collection blocked the executor for .3 s

@@ -6,12 +6,13 @@ import ctypes
 import logging
 import os
 import signal
+import struct
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Generic, NoReturn, TypeVar
 
 import rclpy
@@ -68,7 +69,10 @@ class Worker(Generic[Item]):
         return len(self._queue) + self._busy
 
     def close(self, timeout_s: float = 10.0) -> None:
-        """Finish the queued items, then end the thread; items left after `timeout_s` are dropped."""
+        """Finish the queued items, then end the thread; those left after `timeout_s` are dropped and counted.
+
+        The item in hand has as long again; one that takes longer is counted too, and ends with the process.
+        """
         with self._wake:
             self._wake.wait_for(lambda: not self._queue and not self._busy, timeout_s)
             self._closing = True
@@ -76,6 +80,7 @@ class Worker(Generic[Item]):
             self._queue.clear()
             self._wake.notify_all()
         self._thread.join(timeout_s)
+        self.dropped += self._thread.is_alive()
 
     def _run(self) -> None:
         while True:
@@ -125,8 +130,35 @@ LONGEST_WAIT_S = 60.0
 """Longest time that an interrupted node waits for the nodes it subscribes to."""
 
 SWITCH_S = 0.0005
-M_ARENA_MAX = -8
-"""Option of glibc's mallopt."""
+M_ARENA_MAX, SS_DISABLE = -8, 2
+"""Options of glibc's mallopt and of sigaltstack."""
+
+
+_signals: list[int] = []
+_ends_at_once = False
+
+
+def _take_signal(number: int, _: object) -> None:
+    global _ends_at_once
+    _signals.append(number)
+    if _ends_at_once:
+        _ends_at_once = False
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise KeyboardInterrupt within the block at SIGINT or SIGTERM, as for a node that has nothing to finish yet."""
+    global _ends_at_once
+    if _signals:
+        raise KeyboardInterrupt
+    _ends_at_once = True
+    try:
+        yield
+    finally:
+        _ends_at_once = False
+        # OpenVINO gives the thread a stack for signal handlers that two signals at once overflow
+        ctypes.CDLL(None).sigaltstack(struct.pack("PiN", 0, SS_DISABLE, 0), None)
 
 
 def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> int:
@@ -134,17 +166,17 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
 
     A `UmfError` while the node starts or finishes is one line on stderr and status 1. The first SIGINT or
     SIGTERM ends the spinning, as soon as the node is ready to close; a second one ends it at once. While the node
-    writes its results further ones are ignored.
+    writes its results further ones are ignored, while it opens its models and files the first one ends it.
     """
     # threads return from libraries often, and wait this long for a thread that computes in Python
     sys.setswitchinterval(SWITCH_S)
     with suppress(OSError, AttributeError):
         # two heaps for all threads: by default each has its own, and memory freed by one is unavailable to others
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
-    signals: list[int] = []
+    _signals.clear()
     # first of all: rclpy's handlers would shut the context down before the node's last messages
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: signals.append(number))
+        signal.signal(number, _take_signal)
     try:
         with watchdog.watching(watchdog.PATIENT_S):
             init(arguments)
@@ -153,12 +185,15 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
         complain(error)
         rclpy.try_shutdown()
         return 1
+    except KeyboardInterrupt:
+        rclpy.try_shutdown()
+        return 0
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     status = 0
     try:
         with watchdog.watching():
-            while not signals and rclpy.ok():
+            while not _signals and rclpy.ok():
                 _spin_once(node, executor, 0.2)
                 failure: UmfError | None = getattr(node, "failure", None)
                 if failure is not None:
@@ -166,10 +201,10 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
                     status = 1
                     break
             ready: Callable[[], bool] = getattr(node, "ready_to_close", lambda: True)
-            deadline, first = time.monotonic() + LONGEST_WAIT_S, len(signals)
-            while not (status or ready()) and len(signals) == first and time.monotonic() < deadline and rclpy.ok():
+            deadline, first = time.monotonic() + LONGEST_WAIT_S, len(_signals)
+            while not (status or ready()) and len(_signals) == first and time.monotonic() < deadline and rclpy.ok():
                 _spin_once(node, executor, 0.05)
-    except ExternalShutdownException:
+    except (ExternalShutdownException, KeyboardInterrupt):
         pass
     finally:
         try:
