@@ -35,7 +35,7 @@ def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> Array:
     quaternion = np.asarray(xyzw, dtype=float)
     if not np.isfinite(np.asarray(translation, dtype=float)).all():
         raise ValueError("a translation that is not finite")
-    norm = float(np.linalg.norm(quaternion))
+    norm = math.hypot(*quaternion)  # without a warning where it overflows
     if not np.isfinite(norm) or abs(norm - 1.0) > 0.01:
         raise ValueError(f"not a unit quaternion (norm {norm:.4g})")
     return make_pose(Rotation.from_quat(quaternion).as_matrix(), translation)
