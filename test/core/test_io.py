@@ -11,7 +11,6 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-
 from processes import ENVIRONMENT
 
 from umf_ros.core.errors import OutputError, UmfError

@@ -81,7 +81,8 @@ def test_arguments_reach_the_node() -> None:
 def test_the_log_of_the_graphs_process_is_that_of_the_node(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    code = "import logging, threading, time, warnings\ndef late():\n    time.sleep(1.0)\n"
+    code = "import logging, threading, time, warnings\ndef late():\n"
+    code += "    while 'logging' not in warnings.showwarning.__module__:\n        time.sleep(0.1)\n"
     code += "    warnings.warn('overflow\\nin cast')\n    logging.warning('%s', 'stays')\n"
     (tmp_path / "sitecustomize.py").write_text(code + "threading.Thread(target=late, daemon=True).start()\n")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")

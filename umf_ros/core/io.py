@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from errno import EINVAL, ENOLCK, ENOSYS, EOPNOTSUPP
 from functools import cache
 from itertools import chain, count
 from pathlib import Path
@@ -24,7 +25,6 @@ from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, re
 
 _log = logging.getLogger(__name__)
 NO_LOCKS = "is on a file system that does not support file locks"
-NO_LOCK = "&nolock=1"
 Check = Callable[[sqlite3.Connection], None]
 _DAMAGE = (sqlite3.Error, ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
 """Exceptions that the values of a damaged file raise where rows are read and parsed."""
@@ -104,15 +104,15 @@ def create_run_folder(out: Path, latest: bool = True) -> Path:
     return folder
 
 
-def supports_locks(folder: Path) -> bool:
-    """Return whether files in a writable folder can be locked; on some NFS and FUSE file systems they cannot."""
-    with suppress(OSError), TemporaryFile(dir=folder) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # that of SQLite
-        except OSError:  # a new file is locked by no other process
-            return False
-    return True
+def _lock_options(folder: Path) -> str:
+    """Return SQLite's option for files that cannot be locked, on some NFS and FUSE file systems; else none."""
+    try:
+        with TemporaryFile(dir=folder) as file:  # locked by no other process
+            for lock in (fcntl.flock, fcntl.lockf):  # the latter is that of SQLite
+                lock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return "&nolock=1" if error.errno in (ENOLCK, ENOSYS, EOPNOTSUPP, EINVAL) else ""
+    return ""
 
 
 @cache
@@ -269,14 +269,14 @@ class SqliteFile:
             with writing(self.name, sqlite3.Error):
                 if path is not None:
                     path.parent.mkdir(parents=True, exist_ok=True)
-                    self._options = "" if supports_locks(path.parent) else NO_LOCK
+                    self._options = _lock_options(path.parent)
                 # SQLite deletes a database without a name when it is closed
                 name = f"{path.absolute().as_uri()}?mode=rwc{self._options}" if path else ""
                 return sqlite3.connect(name, uri=True, check_same_thread=False)
         if path is None or not path.is_file():
             raise UmfError(f"there is no {schema.name} {shortened(path)}")
         # SQLite makes files beside one that it reads, unless the folder cannot be written
-        self._options = "" if supports_locks(path.parent) else NO_LOCK
+        self._options = _lock_options(path.parent)
         access = f"mode=ro{self._options}" if os.access(path.parent, os.W_OK) else "immutable=1"
         return sqlite3.connect(f"{path.resolve().as_uri()}?{access}", uri=True, check_same_thread=False)
 

@@ -1,8 +1,8 @@
 """End a stalled process with the stacks of all threads on stderr, so that it can be restarted.
 
-A thread counts the time that the process runs: a suspended one (Ctrl-Z, a paused container) makes no progress, and is not
-stalled. `watching` begins the count, `feed` restarts it, `task` names work that must not stall while other threads feed.
-The exit status is 1. Where a library holds the interpreter lock for good, a timer of the C library sends SIGALRM.
+A thread counts the time that the process runs: a suspended one (Ctrl-Z, a paused container) is not stalled. `watching`
+begins the count, `feed` restarts it, `task` names work that must not stall while other threads feed. The exit status is
+1. Where a library holds the interpreter lock for good, a timer of the C library sends SIGALRM.
 """
 
 from __future__ import annotations

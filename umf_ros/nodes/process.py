@@ -22,7 +22,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from umf_ros.core import watchdog
-from umf_ros.core.errors import ConfigError, UmfError, one_line
+from umf_ros.core.errors import ConfigError, UmfError, one_line, shortened
 
 Item = TypeVar("Item")
 
@@ -102,28 +102,24 @@ class Worker(Generic[Item]):
 class _LogBridge(logging.Handler):
     """Handler that passes records of Python's logging, warnings included, to the logger of a node."""
 
-    def __init__(self, logger: RcutilsLogger) -> None:
-        super().__init__()
-        self._logger = logger
+    logger: RcutilsLogger
 
     def emit(self, record: logging.LogRecord) -> None:
         """Pass a record on in one line; ROS wants a line of code for each level."""
-        text = " ".join(record.getMessage().split())
         if record.levelno >= logging.ERROR:
-            self._logger.error(text)
-        elif record.levelno >= logging.WARNING:
-            self._logger.warning(text)
+            self.logger.error(shortened(record.getMessage()))
         else:
-            self._logger.info(text)
+            self.logger.warning(shortened(record.getMessage()))
+
+
+_bridge = _LogBridge()
 
 
 def log_to(logger: RcutilsLogger) -> None:
-    """Pass all that the process logs or warns of to the logger of its node, in place of that of an earlier node."""
+    """Pass all that the process logs or warns of to the logger of its node."""
+    _bridge.logger = logger
+    logging.getLogger().addHandler(_bridge)
     logging.captureWarnings(True)
-    root = logging.getLogger()
-    for handler in [one for one in root.handlers if isinstance(one, _LogBridge)]:
-        root.removeHandler(handler)
-    root.addHandler(_LogBridge(logger))
 
 
 LONGEST_WAIT_S = 60.0
@@ -134,29 +130,18 @@ M_ARENA_MAX, SS_DISABLE = -8, 2
 """Options of glibc's mallopt and of sigaltstack."""
 
 
-_signals: list[int] = []
-_ends_at_once = False
-
-
-def _take_signal(number: int, _: object) -> None:
-    global _ends_at_once
-    _signals.append(number)
-    if _ends_at_once:
-        _ends_at_once = False
-        raise KeyboardInterrupt
+ENDING = signal.SIGINT, signal.SIGTERM
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Raise KeyboardInterrupt within the block at SIGINT or SIGTERM, as for a node that has nothing to finish yet."""
-    global _ends_at_once
-    if _signals:
-        raise KeyboardInterrupt
-    _ends_at_once = True
+    before = {number: signal.signal(number, signal.default_int_handler) for number in ENDING}
     try:
         yield
     finally:
-        _ends_at_once = False
+        for number, handler in before.items():
+            signal.signal(number, handler)
         # OpenVINO gives the thread a stack for signal handlers that two signals at once overflow
         ctypes.CDLL(None).sigaltstack(struct.pack("PiN", 0, SS_DISABLE, 0), None)
 
@@ -173,27 +158,25 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
     with suppress(OSError, AttributeError):
         # two heaps for all threads: by default each has its own, and memory freed by one is unavailable to others
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
-    _signals.clear()
+    signals: list[int] = []
     # first of all: rclpy's handlers would shut the context down before the node's last messages
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _take_signal)
+    for number in ENDING:
+        signal.signal(number, lambda number, _: signals.append(number))
     try:
         with watchdog.watching(watchdog.PATIENT_S):
             init(arguments)
             node = make_node()
-    except UmfError as error:
-        complain(error)
+    except (UmfError, KeyboardInterrupt) as error:
+        if isinstance(error, UmfError):
+            complain(error)
         rclpy.try_shutdown()
-        return 1
-    except KeyboardInterrupt:
-        rclpy.try_shutdown()
-        return 0
+        return int(isinstance(error, UmfError))
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     status = 0
     try:
         with watchdog.watching():
-            while not _signals and rclpy.ok():
+            while not signals and rclpy.ok():
                 _spin_once(node, executor, 0.2)
                 failure: UmfError | None = getattr(node, "failure", None)
                 if failure is not None:
@@ -201,8 +184,8 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
                     status = 1
                     break
             ready: Callable[[], bool] = getattr(node, "ready_to_close", lambda: True)
-            deadline, first = time.monotonic() + LONGEST_WAIT_S, len(_signals)
-            while not (status or ready()) and len(_signals) == first and time.monotonic() < deadline and rclpy.ok():
+            deadline, first = time.monotonic() + LONGEST_WAIT_S, len(signals)
+            while not (status or ready()) and len(signals) == first and time.monotonic() < deadline and rclpy.ok():
                 _spin_once(node, executor, 0.05)
     except (ExternalShutdownException, KeyboardInterrupt):
         pass
