@@ -74,6 +74,9 @@ class Process:
         finally:
             resource.prlimit(self._process.pid, resource.RLIMIT_FSIZE, limits)
 
+    def send(self, number: int) -> None:
+        self._process.send_signal(number)
+
     def interrupt(self, timeout_s: float = 60.0) -> int:
         if self.exit_code is None:
             self._process.send_signal(signal.SIGINT)

@@ -6,6 +6,7 @@ call raises the same error, and the next start resumes the graph from the log.
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from logging.handlers import QueueHandler
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -79,12 +81,14 @@ class _Proxy:
         with self._lock:
             try:
                 self._pipe.send((name, arguments, named))
-                result, error, faults = self._pipe.recv()
+                result, error, faults, records = self._pipe.recv()
             except (EOFError, OSError):
                 self._ended = self._ended or ProcessEndedError(self._describe_end())
                 raise self._ended from None
         for fault in faults:
             self._on_fault(fault)
+        for record in records:
+            logging.getLogger(record.name).handle(record)
         if error is not None:
             raise error
         return result
@@ -110,6 +114,9 @@ def serve() -> None:
     pipe: Connection[Any, Any] = Connection(0)
     calls: SimpleQueue[tuple[str, tuple[Any, ...], dict[str, Any]]] = SimpleQueue()
     faults: list[OutputError] = []
+    records: SimpleQueue[logging.LogRecord] = SimpleQueue()
+    logging.getLogger().addHandler(QueueHandler(records))  # to the log of the process that started this one
+    logging.captureWarnings(True)
     Thread(target=_receive, args=(pipe, calls), daemon=True).start()
 
     def open_graph(settings: Settings, journal: Path | None) -> DurableGraph:
@@ -135,7 +142,7 @@ def serve() -> None:
         except Exception as caught:  # of any type, also one that cannot be sent
             error = RuntimeError(f"{type(caught).__name__}: {one_line(caught)}")
         with suppress(OSError):
-            pipe.send((result, error, faults))
+            pipe.send((result, error, faults, [records.get() for _ in range(records.qsize())]))
         faults.clear()
 
 

@@ -18,6 +18,7 @@ from umf_ros.core.geometry import (
     logmap,
     make_pose,
     propagate,
+    quantize,
     ros_to_gtsam_covariance,
     transform,
 )
@@ -145,3 +146,11 @@ def test_indices_are_spread_from_the_first_to_the_last_without_repetition(count:
     assert len(chosen) == min(count, most) == len(set(chosen)) and chosen == sorted(chosen)
     assert not chosen or (chosen[0], chosen[-1]) == (0, count - 1)
     assert not chosen or max(np.diff(chosen), default=1) - min(np.diff(chosen), default=1) <= 1
+
+
+def test_points_that_do_not_fit_an_integer_are_left_out() -> None:
+    points = np.float32([[1, 2, 3], [65.5, -65.5, 0], [65.6, 0, 0], [0, 0, -65.6], [np.nan, 0, 0], [0, -np.inf, 0]])
+    stored = quantize(np.vstack([points, np.full((1, 3), 3e38, np.float32)]), 0.002)
+    assert stored.dtype == np.int16
+    np.testing.assert_allclose(stored * 0.002, points[:2], atol=0.001)
+    assert quantize(np.empty((0, 3)), 0.02).shape == (0, 3)

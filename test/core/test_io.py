@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import subprocess
+import sys
+import textwrap
 from contextlib import closing
 from pathlib import Path
 
 import pytest
+from processes import ENVIRONMENT
 
 from umf_ros.core.errors import OutputError, UmfError
 from umf_ros.core.io import Schema, SqliteFile, atomic_write
@@ -131,3 +135,91 @@ def test_a_copy_is_complete_and_a_temporary_file_is_in_no_folder(tmp_path: Path)
     file.close()
     assert contents(tmp_path) == {"copy.sqlite"}
     assert lines(SqliteFile(tmp_path / "copy.sqlite", FIRST, read_only=True)) == [("hello",)]
+
+
+NO_LOCKS = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+static int refused(int fd) { /* of a file below $NO_LOCKS, as on an NFS without its lock service */
+    char link[64], path[4096] = {0};
+    const char *folder = getenv("NO_LOCKS");
+    snprintf(link, sizeof link, "/proc/self/fd/%d", fd);
+    return folder && readlink(link, path, sizeof path - 1) > 0 && !strncmp(path, folder, strlen(folder));
+}
+int flock(int fd, int how) {
+    if (refused(fd)) { errno = ENOLCK; return -1; }
+    return ((int (*)(int, int))dlsym(RTLD_NEXT, "flock"))(fd, how);
+}
+static int call(const char *name, int fd, int command, void *argument) {
+    int is_lock = command == F_SETLK || command == F_SETLKW || command == F_GETLK || command == F_OFD_SETLK;
+    if (is_lock && refused(fd)) { errno = ENOLCK; return -1; }
+    return ((int (*)(int, int, void *))dlsym(RTLD_NEXT, name))(fd, command, argument);
+}
+#define WRAP(name) int name(int fd, int command, ...) { va_list more; va_start(more, command); \\
+    void *argument = va_arg(more, void *); va_end(more); return call(#name, fd, command, argument); }
+WRAP(fcntl)
+WRAP(fcntl64)
+"""
+
+
+def test_a_file_system_without_locks_takes_results_and_shares_nothing(tmp_path: Path) -> None:
+    library, folder = tmp_path / "no_locks.so", tmp_path / "nfs"
+    source = library.with_suffix(".c")
+    source.write_text(NO_LOCKS)
+    folder.mkdir()
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
+    environment = {**ENVIRONMENT, "LD_PRELOAD": str(library), "NO_LOCKS": str(folder)}
+
+    def run(code: str) -> tuple[str, list[str]]:
+        command = [sys.executable, "-c", textwrap.dedent(code), str(folder)]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
+        assert "Traceback" not in done.stderr, done.stderr
+        return done.stdout, done.stderr.splitlines()
+
+    _, told = run("""
+        import sys
+        from pathlib import Path
+        from umf_ros.core.config import PoseGraphSettings
+        from umf_ros.durable_graph import DurableGraph
+        from umf_ros.places.store import KeyframeStore
+        from umf_ros.runs.run_file import RunFile
+        folder = Path(sys.argv[1])
+        run, places = RunFile(folder), KeyframeStore(folder / "places.sqlite", ("thumbnail", 16), 2)
+        graph = DurableGraph(PoseGraphSettings(), folder / "graph.sqlite", print)
+        with run.writing():
+            run.append("keyframes", [[5, 0, "1.0"]])
+        places.save(folder / "copy.sqlite")
+        graph.close()
+        import os
+        os._exit(0)  # killed
+    """)
+    where = f"{folder} is on a file system that does not support file locks"
+    assert told == [f"{where}: no other process may use its files meanwhile"]
+    shown, told = run("""
+        import sys
+        from pathlib import Path
+        from umf_ros.core.errors import UmfError
+        from umf_ros.core.io import lock_file
+        from umf_ros.places.store import KeyframeStore
+        from umf_ros.runs.run_file import RunFile
+        folder = Path(sys.argv[1])
+        print(RunFile(folder, read_only=True).rows("keyframes"))
+        print(len(KeyframeStore(folder / "copy.sqlite", ("thumbnail", 16), 2, read_only=True)))
+        again = RunFile(folder)
+        print(len(again.rows("keyframes")))
+        again.close()
+        try:
+            lock_file(folder / "map.json")  # as for a map that grows
+        except UmfError as error:
+            print(error)
+    """)
+    assert shown.splitlines()[:3] == ["[(5, 0, '1.0')]", "0", "1"]
+    assert told == [f"{where}: no other process may use its files meanwhile"]
+    assert "map.json is on a file system that does not support file locks: it cannot be shared" in shown

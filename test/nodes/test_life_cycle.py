@@ -15,8 +15,9 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from lifecycle_msgs.msg import TransitionEvent
-from processes import wait_until
+from lifecycle_msgs.msg import State, Transition, TransitionEvent
+from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
+from processes import Process, call_service, wait_until
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
@@ -225,3 +226,46 @@ def test_a_fault_in_a_transition_is_told_and_can_be_mended(node: Back, capfd: py
     node.fault = None
     for step in (node.trigger_cleanup, node.trigger_configure, node.trigger_activate):
         assert step() is TransitionCallbackReturn.SUCCESS
+
+
+ASKED = [Transition(id=Transition.TRANSITION_ACTIVATE), Transition(id=99), Transition(label="fly\x1b[31m\nup")]
+ASKED += [Transition(id=Transition.TRANSITION_ON_CONFIGURE_SUCCESS), Transition(label="deactivate"), Transition()]
+
+
+@pytest.mark.parametrize("name", ["loop_closure_node", "pose_graph_node", "map_node"])
+def test_a_transition_that_is_not_possible_is_refused_in_the_response(
+    name: str, ros_context: None, tmp_path: Path
+) -> None:
+    given = ["autostart:=false", "dataset:=s3li-etna", "embedding.method:=thumbnail"]
+    process, client = Process(f"umf_ros.nodes.{name}", tmp_path / "node.log", *given), Node("client")
+
+    def change(transition: Transition) -> bool:
+        request = ChangeState.Request(transition=transition)
+        return call_service(client, ChangeState, f"/{name}/change_state", request).success
+
+    def state() -> int:
+        return call_service(client, GetState, f"/{name}/get_state", GetState.Request()).current_state.id
+
+    for asked in ASKED:
+        assert not change(asked)
+        assert state() == State.PRIMARY_STATE_UNCONFIGURED
+    # the second one of two in a row is queued behind the first
+    both = client.create_client(ChangeState, f"/{name}/change_state")
+    answers = [both.call_async(ChangeState.Request(transition=Transition(label="configure"))) for _ in range(2)]
+    assert wait_until(
+        lambda: all(one.done() for one in answers), 60.0, lambda: rclpy.spin_once(client, timeout_sec=0.1)
+    )
+    assert [one.result().success for one in answers] == [True, False] and state() == State.PRIMARY_STATE_INACTIVE
+    assert change(Transition(label="activate")) and not change(Transition(id=Transition.TRANSITION_CONFIGURE))
+    assert state() == State.PRIMARY_STATE_ACTIVE
+    for kind, service in (
+        (GetAvailableStates, "get_available_states"),
+        (GetAvailableTransitions, "get_available_transitions"),
+        (GetAvailableTransitions, "get_transition_graph"),
+    ):
+        assert call_service(client, kind, f"/{name}/{service}", kind.Request()) is not None
+    assert change(Transition(label="shutdown")) and not change(Transition(label="shutdown"))
+    assert state() == State.PRIMARY_STATE_FINALIZED
+    assert process.output.count("refused: not possible in the state") == len(ASKED) + 3, process.output
+    assert "transition activate" not in process.output and process.interrupt() == 0
+    client.destroy_node()

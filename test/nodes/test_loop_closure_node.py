@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import signal
+import sys
 from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,6 +15,7 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from processes import Process, call_service, wait_until
+from rcl_interfaces.msg import Log
 from rclpy.node import Node
 from recordings import POINT
 from sensor_msgs.msg import Image, PointCloud2, PointField
@@ -142,6 +146,44 @@ def test_it_takes_frames_survives_bad_ones_and_ends_in_order(rig: Rig, node: Pro
     assert "Traceback" not in node.output
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_waits_at_the_end_is_told_and_can_be_played_again(rig: Rig, tmp_path: Path, number: int) -> None:
+    own = f"results_dir:={tmp_path / 'run'}", f"database.path:={tmp_path / 'map.sqlite'}", "worker.queue_size:=100"
+    slow = [sys.executable, str(Path(__file__).parent / "slow_node.py"), "detect"]
+    node = Process(MODULE, tmp_path / "slow.log", *PARAMETERS, *own, command=slow)
+    stamps = [START_NS + i * 213_000_000 for i in range(30)]
+
+    def play(node: Process) -> None:
+        node.wait_for("ready")
+        assert rig.until(lambda: rig.images.get_subscription_count() and rig.clouds.get_subscription_count())
+        rig.until(lambda: False, timeout_s=2.0)  # the node has discovered the rig, too
+        rig.values.clear()
+        rig._rng = np.random.default_rng(0)  # the same recording
+        for stamp_ns in stamps:
+            rig.publish_pair(stamp_ns)
+            rig.until(lambda: False, timeout_s=0.05)
+        assert rig.until(lambda: rig.count("cloud_received") == len(stamps))
+
+    def keyframes() -> list[int]:
+        lines = (tmp_path / "run" / "keyframes.csv").read_text().splitlines()[1:]
+        return [int(line.partition(",")[0]) for line in lines]
+
+    play(node)
+    node.send(number)
+    assert node.interrupt() == 0
+    done = keyframes()
+    (line,) = [one for one in node.output.splitlines() if "were not processed" in one]
+    left, since = re.match(r"(\d+) .* after stamp ([\d.]+) s; played again .* continue the run", line).groups()
+    assert len(stamps) - len(done) - 1 <= int(left) <= len(stamps) - len(done) and len(done) < 20
+    assert done[0] <= round(float(since) * 1e9) + 10**6 <= done[-1] + 10**6
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["keyframes"] == len(done)
+    quick = Process(MODULE, tmp_path / "quick.log", *PARAMETERS, *own)
+    play(quick)
+    assert rig.until(lambda: rig.count("places") >= len(stamps) - 1), quick.output
+    assert quick.interrupt() == 0 and "were not processed" not in quick.output
+    assert sorted(keyframes()) == stamps  # each once
+
+
 def test_results_that_vanish_cost_the_tally_and_nothing_else(rig: Rig, node: Process, tmp_path: Path) -> None:
     rig.publish_pair(START_NS)
     assert rig.until(lambda: rig.count("cloud_received") == 1)
@@ -174,6 +216,8 @@ def test_a_full_disk_shows_at_once_and_ends_nothing(rig: Rig, node: Process) -> 
 
 
 def test_a_clock_that_jumps_back_starts_a_new_session(rig: Rig, node: Process) -> None:
+    logged: list[Log] = []
+    rig.create_subscription(Log, "/rosout", logged.append, 100)
     for lap in range(2):
         for i in range(4):
             rig.publish_pair(START_NS + i * 213_000_000)
@@ -181,6 +225,13 @@ def test_a_clock_that_jumps_back_starts_a_new_session(rig: Rig, node: Process) -
     # the last scan of each lap waits for later stamps; the jump completes the first lap
     assert rig.until(lambda: rig.count("cloud_received") == 8)
     assert rig.until(lambda: 0 < rig.count("places") <= 4), node.output
+    for i in range(8):
+        rig.publish_pair(START_NS - 100 * 10**9 + i * 213_000_000)
+        rig.until(lambda i=i: rig.count("cloud_received") > 8 + i, 5.0)
+    # from the detector, which knows no ROS
+    assert rig.until(lambda: any("a new session begins; the" in one.msg for one in logged)), node.output
+    (line,) = [one for one in logged if "a new session begins; the" in one.msg]
+    assert (line.name, line.level) == ("loop_closure_node", Log.WARN) and line.stamp.sec
     assert node.exit_code is None
 
 

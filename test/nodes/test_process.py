@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from processes import ENVIRONMENT
+from processes import ENVIRONMENT, wait_until
+
+from umf_ros.core.config import Settings
+from umf_ros.graph_process import start_graph
 
 NODE = Path(__file__).parent / "dutiful_node.py"
 
@@ -72,3 +76,18 @@ def test_arguments_that_ros_cannot_read_are_one_line_and_status_1(arguments: lis
 def test_arguments_reach_the_node() -> None:
     ended = start("interrupt", "--ros-args", "-p", "depth:=7")
     assert ended.stdout.splitlines()[0] == "depth 7", ended.stderr
+
+
+def test_the_log_of_the_graphs_process_is_that_of_the_node(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    code = "import logging, threading, time, warnings\ndef late():\n"
+    code += "    while 'logging' not in warnings.showwarning.__module__:\n        time.sleep(0.1)\n"
+    code += "    warnings.warn('overflow\\nin cast')\n    logging.warning('%s', 'stays')\n"
+    (tmp_path / "sitecustomize.py").write_text(code + "threading.Thread(target=late, daemon=True).start()\n")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    graph = start_graph(Settings(), None, print)
+    assert wait_until(lambda: bool(graph.state()) and len(caplog.records) >= 2, 20.0)
+    graph.close()
+    assert "overflow" in caplog.messages[0] and caplog.messages[1] == "stays"
+    assert {one.levelname for one in caplog.records} == {"WARNING"}

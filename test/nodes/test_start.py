@@ -9,7 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from processes import ENVIRONMENT
+import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from processes import ENVIRONMENT, Process, wait_until
 from sources import ROOT
 
 START = "from umf_ros.nodes.start import start; start"
@@ -29,6 +32,27 @@ def test_it_ends_the_process_without_a_word(number: signal.Signals, tmp_path: Pa
     process.send_signal(number)
     assert process.communicate(timeout=30) == ("", "")
     assert process.returncode == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("asked", [False, True])
+def test_a_node_that_opens_its_models_and_files_ends_too(
+    ros_context: None, tmp_path: Path, number: signal.Signals, asked: bool
+) -> None:
+    slow = [sys.executable, str(Path(__file__).parent / "slow_node.py"), "open"]
+    given = ["dataset:=s3li-etna", f"autostart:={not asked}".lower(), f"results_dir:={tmp_path}"]
+    process = Process("", tmp_path / "node.log", *given, command=slow)
+    if asked:
+        client = rclpy.create_node("client")
+        change = client.create_client(ChangeState, "/pose_graph_node/change_state")
+        assert change.wait_for_service(60.0)
+        change.call_async(ChangeState.Request(transition=Transition(label="configure")))
+    process.wait_for("opening")
+    graph = process.child
+    process.send(number)
+    assert process.interrupt(timeout_s=30.0) == 0  # while the process of the graph ends, a second one changes nothing
+    assert "Traceback" not in process.output
+    assert wait_until(lambda: not Path(f"/proc/{graph}").exists())
 
 
 def test_a_node_that_is_loaded_runs(tmp_path: Path) -> None:

@@ -263,3 +263,29 @@ def test_of_colours_in_pairs_the_brightness_is_taken(encoding: str, place: int) 
     pixels = np.full((4, 6, 2), 200, np.uint8)
     pixels[..., place] = np.arange(24).reshape(4, 6)
     np.testing.assert_array_equal(decode_image(image(0, pixels, encoding)), np.arange(24).reshape(4, 6))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38, 1e20, 1e9, 65.6, -9999.0, 1e-40, 5e-324, 0.0])
+def test_numbers_that_no_sensor_sends_raise_no_warning(kind: str, value: float) -> None:
+    rng = np.random.default_rng(0)
+    for times in ("t", "time", "timestamp"):
+        names = ("x", "y", "z", "intensity", times)
+        for name in names:
+            for share in (0.1, 1.0):
+                records = np.zeros(300, [(one, kind) for one in names])
+                records["x"], records["y"], records["z"] = rng.uniform(5, 15, (3, 300))
+                records[times] = np.linspace(0.0, 0.2, 300)
+                with np.errstate(all="ignore"):
+                    records[name][rng.random(300) < share] = value
+                found = decode_cloud(cloud(START_NS, records))
+                assert np.isfinite(found.points).all()
+                assert found.time_offset_ns is None or np.abs(found.time_offset_ns).max(initial=0) < 10**9
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_orientation_that_overflows_is_refused_without_a_warning() -> None:
+    message = odometry(START_NS, drive(0.0))
+    message.pose.pose.orientation.w = 1e300
+    assert kind_of(decode_odometry, message) == "pose"

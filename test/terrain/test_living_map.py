@@ -122,3 +122,18 @@ def test_scans_without_a_path_are_bounded(monkeypatch: pytest.MonkeyPatch) -> No
     assert not living.update() and living.kept == (5, len(METRES))
     living.correct(path(straight()))
     assert living.update() and living.voxels.scans == 5 and living.newest_ns == 19 * SECOND
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("far_m", [65.6, -70.0, 135.0, 9000.0, np.nan, np.inf])
+def test_a_return_beyond_the_range_of_a_stored_point_is_no_wall_nearby(axis: int, far_m: float) -> None:
+    living, clean = LivingMap(TerrainSettings()), driven()
+    for row, x in enumerate(METRES):
+        strange = np.tile(np.float32([3.0, 3.0, 0.5]), (20, 1))
+        strange[:, axis] = far_m
+        living.add_odometry(row * SECOND, pose_at(x))
+        living.add_scan(row * SECOND, np.vstack([SCANS[row], strange]), BODY_T_LIDAR[:3, 3])
+    for one in (living, clean):
+        one.correct(path(straight()))
+        assert one.update()
+    np.testing.assert_array_equal(living.voxels.points(), clean.voxels.points())

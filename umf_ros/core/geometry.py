@@ -35,7 +35,7 @@ def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> Array:
     quaternion = np.asarray(xyzw, dtype=float)
     if not np.isfinite(np.asarray(translation, dtype=float)).all():
         raise ValueError("a translation that is not finite")
-    norm = float(np.linalg.norm(quaternion))
+    norm = math.hypot(*quaternion)  # without a warning where it overflows
     if not np.isfinite(norm) or abs(norm - 1.0) > 0.01:
         raise ValueError(f"not a unit quaternion (norm {norm:.4g})")
     return make_pose(Rotation.from_quat(quaternion).as_matrix(), translation)
@@ -171,6 +171,12 @@ def gtsam_to_ros_covariance(covariance: ArrayLike, pose: Array) -> Array:
     """Return the inverse of `ros_to_gtsam_covariance`: (6, 6) in ROS order about the parent axes."""
     turn = np.kron(np.eye(2), pose[:3, :3])
     return turn @ np.roll(np.asarray(covariance, dtype=float).reshape(6, 6), 3, axis=(0, 1)) @ turn.T
+
+
+def quantize(points: NDArray[Any], unit_m: float) -> NDArray[np.int16]:
+    """Return points (N, 3) m as (M, 3) int16 in `unit_m`, without those that are not finite or do not fit."""
+    fits = (np.abs(points) <= np.iinfo(np.int16).max * unit_m).all(axis=1)  # false for NaN
+    return np.rint(points[fits] / unit_m).astype(np.int16)
 
 
 def evenly(count: int, most: int) -> NDArray[np.intp]:

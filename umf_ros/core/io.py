@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import fcntl
+import logging
 import os
 import sqlite3
 from collections import Counter
@@ -11,14 +12,19 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from errno import EINVAL, ENOLCK, ENOSYS, EOPNOTSUPP
+from functools import cache
 from itertools import chain, count
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import yaml
 
 from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, reading, shortened, writing
 
+_log = logging.getLogger(__name__)
+NO_LOCKS = "is on a file system that does not support file locks"
 Check = Callable[[sqlite3.Connection], None]
 _DAMAGE = (sqlite3.Error, ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
 """Exceptions that the values of a damaged file raise where rows are read and parsed."""
@@ -116,6 +122,22 @@ def create_run_folder(out: Path, latest: bool = True) -> Path:
     return folder
 
 
+def _lock_options(folder: Path) -> str:
+    """Return SQLite's option for files that cannot be locked, on some NFS and FUSE file systems; else none."""
+    try:
+        with TemporaryFile(dir=folder) as file:  # locked by no other process
+            for lock in (fcntl.flock, fcntl.lockf):  # the latter is that of SQLite
+                lock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return "&nolock=1" if error.errno in (ENOLCK, ENOSYS, EOPNOTSUPP, EINVAL) else ""
+    return ""
+
+
+@cache
+def _warn_without_locks(folder: Path) -> None:
+    _log.warning("%s %s: no other process may use its files meanwhile", folder, NO_LOCKS)
+
+
 def lock_file(path: Path) -> int:
     """Lock a file against other processes, until the descriptor is closed or the process ends.
 
@@ -123,7 +145,7 @@ def lock_file(path: Path) -> int:
     of the process closes that file. Readers need no lock.
 
     Raises:
-        UmfError: another process, which is named, holds the lock.
+        UmfError: another process, which is named, holds the lock, or the file system does not support locks.
         OutputError: the lock file cannot be made.
     """
     with writing(path):
@@ -135,6 +157,9 @@ def lock_file(path: Path) -> int:
         holder = os.pread(descriptor, 20, 0).decode("ascii", "replace").strip()
         os.close(descriptor)
         raise UmfError(f"{path} is in use by another process ({holder or 'unknown'}); only one may write") from None
+    except OSError:
+        os.close(descriptor)
+        raise UmfError(f"{path} {NO_LOCKS}: it cannot be shared by several processes") from None
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
     return descriptor
@@ -176,6 +201,7 @@ class SqliteFile:
         self.name = str(path or f"temporary {schema.name}")
         self._path, self._read_only = path, read_only
         self._lock: int | None = None
+        self._options = ""
         self.connection = self._connect(schema)
         try:
             self._check_plain()
@@ -234,10 +260,12 @@ class SqliteFile:
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path, sqlite3.Error) as part, ExitStack() as opened:
-            target = opened.enter_context(closing(sqlite3.connect(part)))
+            # of no other process, in a folder that may not support locks
+            target = sqlite3.connect(f"{part.absolute().as_uri()}?nolock=1", uri=True)
+            opened.enter_context(closing(target))
             source = self.connection
             if self._path is not None:  # a reader of its own makes no writer wait
-                source = sqlite3.connect(f"{self._path.absolute().as_uri()}?mode=ro", uri=True)
+                source = sqlite3.connect(f"{self._path.absolute().as_uri()}?mode=ro{self._options}", uri=True)
                 opened.enter_context(closing(source))
             source.backup(target)
 
@@ -259,12 +287,15 @@ class SqliteFile:
             with writing(self.name, sqlite3.Error):
                 if path is not None:
                     path.parent.mkdir(parents=True, exist_ok=True)
+                    self._options = _lock_options(path.parent)
                 # SQLite deletes a database without a name when it is closed
-                return sqlite3.connect(path or "", check_same_thread=False)
+                name = f"{path.absolute().as_uri()}?mode=rwc{self._options}" if path else ""
+                return sqlite3.connect(name, uri=True, check_same_thread=False)
         if path is None or not path.is_file():
             raise UmfError(f"there is no {schema.name} {shortened(path)}")
         # SQLite makes files beside one that it reads, unless the folder cannot be written
-        access = "mode=ro" if os.access(path.parent, os.W_OK) else "immutable=1"
+        self._options = _lock_options(path.parent)
+        access = f"mode=ro{self._options}" if os.access(path.parent, os.W_OK) else "immutable=1"
         return sqlite3.connect(f"{path.resolve().as_uri()}?{access}", uri=True, check_same_thread=False)
 
     def _open(self, schema: Schema, check: Check | None) -> None:
@@ -275,9 +306,12 @@ class SqliteFile:
         if found and check is not None:
             check(self.connection)
         if not self._read_only:
-            if self._path is not None:
+            if self._options:
+                _warn_without_locks(Path(self.name).parent)
+            elif self._path is not None:
                 self._lock = lock_file(self._path)
-            self.connection.execute("PRAGMA journal_mode = WAL")
+            # a write-ahead log needs locks
+            self.connection.execute(f"PRAGMA journal_mode = {'DELETE' if self._options else 'WAL'}")
             self.connection.execute("PRAGMA synchronous = NORMAL")
             self.migrate(schema)
 

@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +28,12 @@ from std_srvs.srv import Trigger
 
 from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics, topics_of
-from umf_ros.core.errors import ConfigError, MessageError, OutputError, UmfError, either
+from umf_ros.core.errors import ConfigError, MessageError, OutputError, UmfError, either, shortened
 from umf_ros.core.io import check_writable
 from umf_ros.nodes.conversions import from_time, latched, sensor_qos
 from umf_ros.nodes.diagnostics import WARN, InputWatch
 from umf_ros.nodes.parameters import changed_settings, declare
-from umf_ros.nodes.process import Worker
+from umf_ros.nodes.process import Worker, interruptible, log_to
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.tf import PATIENCE_S, TOPIC, BodyFrames, StaticTransforms
@@ -70,6 +71,9 @@ class BaseNode(LifecycleNode, ABC):
     def __init__(self, name: str, results: str, wanted: Collection[str] = FRONT_END) -> None:
         """Declare the parameters; `results` describes the folder `results_dir`, `wanted` are inputs."""
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
+        log_to(self.get_logger())
+        change_state = self._service_change_state.callback
+        self._service_change_state.callback = partial(self._answer_transition, change_state)
         self._settings, self._results = declare(self, results)
         self._input_names, self._finder = wanted, None
         if must_find(self._settings, wanted):
@@ -118,6 +122,15 @@ class BaseNode(LifecycleNode, ABC):
             self._settings, self._finder = found, None
             self.get_logger().info(describe_inputs(found, self._input_names))
         return found is not None
+
+    def _answer_transition(self, change_state: Callable[..., Any], request: Any, response: Any) -> Any:
+        """Answer a request to change the state; rclpy leaves one that is not possible without an answer."""
+        asked = request.transition.label or request.transition.id
+        if not any(asked in possible[:2] for possible in self._state_machine.available_transitions):
+            state = self._state_machine.current_state[1]
+            self.get_logger().warning(f"transition {shortened(asked)} refused: not possible in the state '{state}'")
+            return response  # its success is false
+        return change_state(request, response)
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Configure the node; an error of the user is one line and a failure."""
@@ -206,7 +219,8 @@ class BaseNode(LifecycleNode, ABC):
         before, self._unwritten = self._entities(), None
         try:
             with watchdog.watching(watchdog.PATIENT_S), ExitStack() as self._opening:
-                self._open()
+                with interruptible():
+                    self._open()
                 self._opening.pop_all()
             self._opened = True
             # permanent objects: their garbage collection blocked the executor for .3 s

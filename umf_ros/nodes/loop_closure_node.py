@@ -47,6 +47,9 @@ if TYPE_CHECKING:
 
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
 INTAKE_QUEUE = 400
+DECODE_S, DETECT_S = 0.5, 2.0
+"""Longest time for waiting messages and frames at the end, and as long again for the one in hand: 5 s in all."""
+RESUME = "played again into a node with the same results_dir and database.path, they continue the run"
 SCAN_DEPTH = 50
 MESSAGE_TYPES = {"cloud": PointCloud2, "odometry": Odometry}
 MESSAGE_TYPES |= dict.fromkeys(("left_image", "right_image"), Image)
@@ -82,7 +85,7 @@ class LoopClosureNode(BaseNode):
         self._publisher = ClosurePublisher(self, settings.frames)
         self._publisher.publish_closures([] if self._recorder is None else self._recorder.earlier_closures)
         self._lock = threading.Lock()
-        self._paused = False
+        self._paused = self._ends_session = False
         self._wanted: Settings | None = None
         self._closures = self._between = 0
         self._last: Detection | None = None
@@ -100,12 +103,16 @@ class LoopClosureNode(BaseNode):
         self._offer(None, "~/pause", self._pause, SetBool)
 
     def _finish(self) -> None:
-        """Finish every frame in hand and write the results."""
+        """Finish the frames that wait, as far as there is time, and write the results."""
         self._saver.close(timeout_s=watchdog.PATIENT_S)
-        self._decoder.close()
+        last, dropped = self._last, self._worker.dropped + self._decoder.dropped
+        self._decoder.close(timeout_s=DECODE_S)
         for frame in self._synchronizer.flush():
             self._worker.submit(frame)
-        self._worker.close(timeout_s=30.0)
+        self._worker.close(timeout_s=DETECT_S)
+        if left := self._worker.dropped + self._decoder.dropped - dropped:
+            since = f"after stamp {last.frame_stamp_ns * 1e-9:.3f} s" if last else "from the first one on"
+            self.get_logger().warning(f"{left} waiting messages and frames were not processed: {since}; {RESUME}")
         self._writer.close()
         self._publisher.wait_for_subscribers()
         try:
@@ -146,6 +153,9 @@ class LoopClosureNode(BaseNode):
             wanted, self._wanted = self._wanted, None
             if wanted is not None:
                 self._detector.retune(wanted)
+            if self._ends_session:
+                self._ends_session = False
+                self._detector.end_session()
             detection = self._detector.process(frame, lambda found: self._publisher.publish_closures(found.closures))
             # before the database drops them
             matches = {v.candidate.stamp_ns: self._detector.database[v.candidate.index] for v in detection.verdicts}
@@ -219,8 +229,7 @@ class LoopClosureNode(BaseNode):
         return f"{len(self._detector.database)} places saved to {path}"
 
     def _reset(self, _: Any) -> str:
-        with self._lock:
-            self._detector.end_session()
+        self._ends_session = True  # the executor must not wait for the current keyframe
         return "a new session begins with the next frame; all places are kept (umf places deletes them)"
 
     def _pause(self, request: Any) -> str:

@@ -6,21 +6,23 @@ import ctypes
 import logging
 import os
 import signal
+import struct
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Generic, NoReturn, TypeVar
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from umf_ros.core import watchdog
-from umf_ros.core.errors import ConfigError, UmfError, one_line
+from umf_ros.core.errors import ConfigError, UmfError, one_line, shortened
 
 Item = TypeVar("Item")
 
@@ -67,7 +69,10 @@ class Worker(Generic[Item]):
         return len(self._queue) + self._busy
 
     def close(self, timeout_s: float = 10.0) -> None:
-        """Finish the queued items, then end the thread; items left after `timeout_s` are dropped."""
+        """Finish the queued items, then end the thread; those left after `timeout_s` are dropped and counted.
+
+        The item in hand has as long again; one that takes longer is counted too, and ends with the process.
+        """
         with self._wake:
             self._wake.wait_for(lambda: not self._queue and not self._busy, timeout_s)
             self._closing = True
@@ -75,6 +80,7 @@ class Worker(Generic[Item]):
             self._queue.clear()
             self._wake.notify_all()
         self._thread.join(timeout_s)
+        self.dropped += self._thread.is_alive()
 
     def _run(self) -> None:
         while True:
@@ -93,12 +99,51 @@ class Worker(Generic[Item]):
                 self._on_error(error)
 
 
+class _LogBridge(logging.Handler):
+    """Handler that passes records of Python's logging, warnings included, to the logger of a node."""
+
+    logger: RcutilsLogger
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Pass a record on in one line; ROS wants a line of code for each level."""
+        if record.levelno >= logging.ERROR:
+            self.logger.error(shortened(record.getMessage()))
+        else:
+            self.logger.warning(shortened(record.getMessage()))
+
+
+_bridge = _LogBridge()
+
+
+def log_to(logger: RcutilsLogger) -> None:
+    """Pass all that the process logs or warns of to the logger of its node."""
+    _bridge.logger = logger
+    logging.getLogger().addHandler(_bridge)
+    logging.captureWarnings(True)
+
+
 LONGEST_WAIT_S = 60.0
 """Longest time that an interrupted node waits for the nodes it subscribes to."""
 
 SWITCH_S = 0.0005
-M_ARENA_MAX = -8
-"""Option of glibc's mallopt."""
+M_ARENA_MAX, SS_DISABLE = -8, 2
+"""Options of glibc's mallopt and of sigaltstack."""
+
+
+ENDING = signal.SIGINT, signal.SIGTERM
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise KeyboardInterrupt within the block at SIGINT or SIGTERM, as for a node that has nothing to finish yet."""
+    before = {number: signal.signal(number, signal.default_int_handler) for number in ENDING}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        # OpenVINO gives the thread a stack for signal handlers that two signals at once overflow
+        ctypes.CDLL(None).sigaltstack(struct.pack("PiN", 0, SS_DISABLE, 0), None)
 
 
 def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> int:
@@ -106,7 +151,7 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
 
     A `UmfError` while the node starts or finishes is one line on stderr and status 1. The first SIGINT or
     SIGTERM ends the spinning, as soon as the node is ready to close; a second one ends it at once. While the node
-    writes its results further ones are ignored.
+    writes its results further ones are ignored, while it opens its models and files the first one ends it.
     """
     # threads return from libraries often, and wait this long for a thread that computes in Python
     sys.setswitchinterval(SWITCH_S)
@@ -115,16 +160,17 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
     signals: list[int] = []
     # first of all: rclpy's handlers would shut the context down before the node's last messages
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ENDING:
         signal.signal(number, lambda number, _: signals.append(number))
     try:
         with watchdog.watching(watchdog.PATIENT_S):
             init(arguments)
             node = make_node()
-    except UmfError as error:
-        complain(error)
+    except (UmfError, KeyboardInterrupt) as error:
+        if isinstance(error, UmfError):
+            complain(error)
         rclpy.try_shutdown()
-        return 1
+        return int(isinstance(error, UmfError))
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     status = 0
@@ -141,7 +187,7 @@ def run(make_node: Callable[[], Node], arguments: list[str] | None = None) -> in
             deadline, first = time.monotonic() + LONGEST_WAIT_S, len(signals)
             while not (status or ready()) and len(signals) == first and time.monotonic() < deadline and rclpy.ok():
                 _spin_once(node, executor, 0.05)
-    except ExternalShutdownException:
+    except (ExternalShutdownException, KeyboardInterrupt):
         pass
     finally:
         try:

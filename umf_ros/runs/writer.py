@@ -21,7 +21,7 @@ from umf_ros import __version__
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, Keyframe
-from umf_ros.core.geometry import Array, evenly
+from umf_ros.core.geometry import Array, evenly, quantize
 from umf_ros.core.io import create_run_folder, memory_mb, write_atomically
 from umf_ros.runs.run_file import (
     NAME,
@@ -228,7 +228,7 @@ class RunRecorder(RunFile):
 def picture_of(frame: Frame, keyframe: Keyframe) -> Picture:
     """Reduce the left image and the scan of a keyframe to the size in the report."""
     points = keyframe.points[evenly(len(keyframe.points), SCAN_POINTS)]
-    scan = np.clip(np.rint(points / SCAN_UNIT_M), -32767, 32767).astype(np.int16)
+    scan = quantize(points, SCAN_UNIT_M)
     if frame.left is None:
         return Picture(frame.stamp_ns, b"", 0, 0, scan)
     height, width = frame.left.shape

@@ -50,6 +50,8 @@ TIME_NAMES = ("point_time_offset", "offset_time", "t", "time", "time_offset", "t
 FURTHEST_RETURN_M = 1e4
 """Largest range of a return (*by hand*); grids over points further apart run out of cells."""
 LONGEST_SWEEP_NS = 1_000_000_000
+LARGEST_TIME = 9e18
+"""Upper bound of times of points, in any unit: stamps are integers of 64 bits."""
 NO_RETURN_RANGE_M = 1.0
 """Range that the Blickfeld driver gives pulses without a return, with intensity 0."""
 
@@ -171,6 +173,8 @@ def _time_offsets_ns(records: NDArray[Any], real: NDArray[np.bool_], message: An
     if name is None:
         return None
     times = records[name][real]
+    if times.dtype.kind == "f" and not (np.abs(times) < LARGEST_TIME).all():  # true for NaN
+        return None
     if times.dtype.kind in "ui":
         offsets = times.astype(np.int64)
     elif len(times) and times[0] > 1e17:  # ns since the epoch, as Livox' driver for PCL writes them
@@ -178,7 +182,7 @@ def _time_offsets_ns(records: NDArray[Any], real: NDArray[np.bool_], message: An
     elif len(times) and times[0] > 1e8:  # s since the epoch, as Hesai writes them
         offsets = np.rint((times - stamp_ns(message) * 1e-9) * 1e9).astype(np.int64)
     else:
-        offsets = np.rint(times.astype(float) * 1e9).astype(np.int64)
+        offsets = np.rint(times.clip(-1e9, 1e9).astype(float) * 1e9).astype(np.int64)
     # no sweep takes a second: such offsets count from another origin
     return offsets if not len(offsets) or np.abs(offsets).max() < LONGEST_SWEEP_NS else None
 

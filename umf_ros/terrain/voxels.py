@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.config import TerrainSettings
 from umf_ros.core.frames import Points
-from umf_ros.core.geometry import Array, cubes, heading, invert, make_pose, transform
+from umf_ros.core.geometry import Array, cubes, heading, invert, make_pose, quantize, transform
 from umf_ros.core.trajectory import MAX_GAP_S, Trajectory, bracket
 from umf_ros.verification.visibility import RangeImage, Sight
 
@@ -124,7 +124,7 @@ class VoxelMap:
 
 
 UNIT_M = 0.002
-"""Unit of stored points: in two bytes, up to 65 m."""
+"""Unit of stored points in two bytes; returns beyond 65.5 m along an axis are not stored."""
 ODOMETRY_NS = 100_000_000
 """Period of the odometry that is kept."""
 LEVER_M = 10.0  # by hand: distance of points at which a turn of a pose is measured
@@ -195,7 +195,7 @@ class LivingMap:
 
     def add_scan(self, stamp_ns: int, points: Points, viewpoint: Array) -> None:
         """Add a scan: points (N, 3) m and the position (3,) of the sensor, body frame."""
-        self._scans.append((stamp_ns, np.rint(points / UNIT_M).astype(np.int16), viewpoint))
+        self._scans.append((stamp_ns, quantize(points, UNIT_M), viewpoint))
         self.added += 1
 
     def correct(self, path: Trajectory | None) -> None:
