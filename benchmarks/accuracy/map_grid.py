@@ -1,6 +1,6 @@
 """Accuracy of the map of the ground against the true surface of a simulated world, with obstacles that are moved.
 
-`python benchmarks/accuracy/map_grid.py [--seed N] [--noise] [--json FILE]`
+`python benchmarks/accuracy/map_grid.py [--seed N] [--noise] [--diagonal M] [--json FILE]`
 
 A drive of two laps. In the first one, crates, a column and people stand beside the route, and people walk; in the
 second one they are gone. The grid is compared with that of the true surface, sampled every 5 cm, where both are known:
@@ -11,12 +11,18 @@ second one they are gone. The grid is compared with that of the true surface, sa
 - `static_lost`: share of voxels that are left out on the same drive where nothing moves.
 
 `--noise`: poses are wrong by 1 cm and 0.1 degrees, each keyframe for itself.
+
+`--diagonal M`: instead, the memory of a straight path of so many metres at 45 degrees to the cells, all ground
+known up to 25 m beside it: peak of the grid, the published grid and all files, beyond that of the points.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
+import resource
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,12 +33,12 @@ import open3d as o3d
 
 from umf_ros.core.config import TerrainSettings
 from umf_ros.core.frames import Points
-from umf_ros.core.geometry import Array, expmap, transform
+from umf_ros.core.geometry import Array, expmap, make_pose, transform
 from umf_ros.lab.simulation.lidar import Lidar, pulse_directions
 from umf_ros.lab.simulation.presets import find_preset
 from umf_ros.lab.simulation.simulator import START_NS, Simulator
-from umf_ros.terrain.grid import FREE, NEAR_LIMIT, OBSTACLE, UNKNOWN, TerrainGrid, make_grid
-from umf_ros.terrain.voxels import VoxelMap
+from umf_ros.terrain.grid import FREE, NEAR_LIMIT, OBSTACLE, UNKNOWN, TerrainGrid, make_grid, write_terrain
+from umf_ros.terrain.voxels import REACH_M, VoxelMap
 from umf_ros.verification import thin_scan
 
 FIRST_SEED = 20_000
@@ -165,12 +171,12 @@ def measure(seed: int, noise: bool) -> dict[str, Any]:
     laps = int(np.searchsorted(drive.metres, LAP_M))
     voxels, began = VoxelMap(SETTINGS.cell_m), time.process_time()
     voxels.add(scans[:laps])
-    first = make_grid(voxels.points(), SETTINGS)
+    first = make_grid(voxels.points(), SETTINGS).overview(SETTINGS.max_cells)
     voxels.add(scans[laps:])
-    final = make_grid(voxels.points(), SETTINGS)
+    final = make_grid(voxels.points(), SETTINGS).overview(SETTINGS.max_cells)
     took = time.process_time() - began
     surface = drive.true_points(final)
-    truth = make_grid(surface, SETTINGS)
+    truth = make_grid(surface, SETTINGS).overview(SETTINGS.max_cells)
     drive.metres = drive.metres + LAP_M  # the same drive with nothing that moves: nothing may be left out
     still = VoxelMap(SETTINGS.cell_m)
     still.add([(drive.scan(row), drive.body_T_lidar, pose) for row, pose in enumerate(poses)])
@@ -180,14 +186,49 @@ def measure(seed: int, noise: bool) -> dict[str, Any]:
     return figures | {"static_lost": 1 - len(still.points()) / len(still), "ms_per_keyframe": 1e3 * took / len(scans)}
 
 
+def write_diagonal(length_m: float, sent: Any) -> None:
+    """Grid and files of a straight path, in a process of its own, whose peak is theirs."""
+    steps = np.arange(0.0, length_m, SETTINGS.cell_m, np.float32)
+    aside = np.arange(-REACH_M, REACH_M, SETTINGS.cell_m, np.float32)
+    points = np.empty((len(steps) * len(aside), 3), np.float32)
+    for row, along in enumerate(steps):
+        part = points[row * len(aside) : (row + 1) * len(aside)]
+        part[:, 0], part[:, 1] = (along - aside) * np.sqrt(0.5), (along + aside) * np.sqrt(0.5)
+        part[:, 2] = np.sin(along / 30)
+    before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    world = make_pose(np.eye(3), [100.0, 50.0, 3.0]), np.array([37.75, 14.99, 1800.0])
+    with tempfile.TemporaryDirectory() as folder:
+        shown = make_grid(points, SETTINGS).around(np.array([100.0, 100.0]), SETTINGS.max_cells)
+        written = write_terrain(Path(folder), points, SETTINGS, world)
+        files = {path.name: path.stat().st_size / 1e6 for path in Path(folder).iterdir()}
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - before_mb
+    sent.send(
+        {"points_mb": points.nbytes / 2**20, "grid_and_files_mb": peak_mb, "published_cells": shown.cells.size}
+        | {f"{name}_mb": size for name, size in sorted(files.items())}
+        | {"written": written}
+    )
+
+
+def diagonal(length_m: float) -> dict[str, Any]:
+    """The memory of the grid and the files of a path of so many metres, MB."""
+    received, sent = multiprocessing.Pipe()
+    context = multiprocessing.get_context("spawn")
+    process = context.Process(target=write_diagonal, args=(length_m, sent))
+    process.start()
+    process.join()
+    return {"length_m": length_m, **received.recv()}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=FIRST_SEED)
     parser.add_argument("--noise", action="store_true")
+    parser.add_argument("--diagonal", type=float, metavar="M")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    figures = measure(arguments.seed, arguments.noise)
-    print("\n".join(f"{name:18s} {value:.4g}" for name, value in figures.items()))
+    figures = diagonal(arguments.diagonal) if arguments.diagonal else measure(arguments.seed, arguments.noise)
+    for name, value in figures.items():
+        print(f"{name:18s} {value if isinstance(value, str) else f'{value:.4g}'}")
     if arguments.json:
         arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
 

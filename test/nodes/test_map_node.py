@@ -161,3 +161,23 @@ def test_a_scan_of_another_kind_is_one_line(rig: Rig, process: Process) -> None:
     rig.until(lambda: rig.values.get("scan") == "3")
     assert process.output.count("keyframe scan without the fields") == 1
     assert process.interrupt() == 0
+
+
+def test_a_grid_above_the_limit_shows_the_surroundings_of_the_rover(rig: Rig, tmp_path: Path) -> None:
+    process = Process("umf_ros.nodes.map_node", tmp_path / "node.log", "dataset:=s3li-etna", "terrain.max_cells:=10000")
+    try:
+        process.wait_for("ready")
+        rig.until(lambda: rig.scans.get_subscription_count() and rig.odometry.get_subscription_count())
+        rig.listen("grid")
+        there = [pose_at(x) for x in np.arange(0.0, 12.0, 0.5)]
+        rig.drive(WALL, there)
+        rig.correct(there)
+        rig.until(lambda: rig.heard["grid"])
+        info = rig.heard["grid"][-1][1].info
+        assert (info.width, info.height) == (100, 100)
+        assert abs(info.origin.position.x + 10.0 - 11.5) < 0.3 and abs(info.origin.position.y + 10.0) < 0.3
+        rig.until(lambda: rig.values.get("grid_cropped_to", "").startswith("20 x 20 m in cells of 0.2 m instead of"))
+        assert process.output.count("map_grid shows only the surroundings of the rover: 20 x 20 m") == 1
+        assert process.interrupt() == 0
+    finally:
+        process.kill()

@@ -28,8 +28,9 @@ def hill(points: int = 40_000) -> Array:
 
 
 def test_navigation_reads_the_grid_as_it_was(tmp_path: Path) -> None:
-    grid = make_grid(hill(), SETTINGS)
-    write_grid(tmp_path, grid)
+    tiles = make_grid(hill(), SETTINGS)
+    assert write_grid(tmp_path, tiles, SETTINGS.max_cells) == "map.yaml, map.pgm"
+    grid = tiles.overview(SETTINGS.max_cells)
     about = yaml.safe_load((tmp_path / "map.yaml").read_text())
     image = cv2.imread(str(tmp_path / about["image"]), cv2.IMREAD_UNCHANGED)
     # the rule of Nav2's map_server in the mode trinary
@@ -45,7 +46,7 @@ def test_navigation_reads_the_grid_as_it_was(tmp_path: Path) -> None:
 
 def test_heights_are_where_they_are_on_earth(tmp_path: Path) -> None:
     turn = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [100.0, 50.0, 3.0])
-    assert write_terrain(tmp_path, hill(), SETTINGS, (turn, ORIGIN)) == ""
+    assert write_terrain(tmp_path, hill(), SETTINGS, (turn, ORIGIN)) == "map.yaml, map.pgm, elevation.tif"
     place = turn @ [14.1, 2.1, 1.41, 1.0]  # on the wedge
     latitude, longitude, height = from_enu(place[None, :3], ORIGIN)[0]
     with rasterio.open(tmp_path / "elevation.tif") as file:
@@ -67,7 +68,7 @@ def test_without_an_origin_heights_are_in_the_map(tmp_path: Path) -> None:
 
 
 def test_nothing_is_written_about_no_ground(tmp_path: Path) -> None:
-    assert write_terrain(tmp_path, np.empty((0, 3)), SETTINGS) == ""
+    assert "no ground is known" in write_terrain(tmp_path, np.empty((0, 3)), SETTINGS)
     assert not list(tmp_path.iterdir())
 
 
@@ -82,3 +83,28 @@ def test_trajectories_are_valid_geojson(tmp_path: Path) -> None:
     line = np.array(json.loads((tmp_path / "a.geojson").read_text())["features"][0]["geometry"]["coordinates"])
     found = to_enu(line[:, [1, 0, 2]], ORIGIN)
     np.testing.assert_allclose(found, [[0, 5, 1], [100, 5, 1], [200, 5, 1]], atol=1e-3)
+
+
+def test_a_large_map_says_how_it_was_limited_and_keeps_all_heights(tmp_path: Path) -> None:
+    steps = np.arange(0.0, 300.0, 0.1)
+    strip = np.concatenate([np.column_stack([steps, steps + aside, 0.1 * steps]) for aside in np.arange(-4, 4, 0.1)])
+    settings = TerrainSettings(max_cells=250_000)
+    written = write_terrain(tmp_path, strip - [100.0, 40.0, 0.0], settings)
+    assert "in cells of 0.8 m instead of 300 x 308 m in cells of 0.2 m, by terrain.max_cells" in written
+    about = yaml.safe_load((tmp_path / "map.yaml").read_text())
+    image = cv2.imread(str(tmp_path / "map.pgm"), cv2.IMREAD_UNCHANGED)
+    assert about["resolution"] == 0.8 and image.size <= 250_000 and (image == 254).any()
+    with rasterio.open(tmp_path / "elevation.tif") as file:
+        assert file.shape == (1540, 1500) and file.block_shapes == [(256, 256)]
+        heights = file.read(1)
+        places = np.column_stack([steps, steps])[3::97] - [100.0, 40.0] + 0.05
+        read = np.concatenate(list(file.sample(places)))
+    np.testing.assert_allclose(read, 0.1 * (places[:, 0] + 100), atol=0.05)
+    assert np.isnan(heights).mean() > 0.9
+    assert (tmp_path / "elevation.tif").stat().st_size < 0.1 * heights.nbytes  # empty blocks take no space
+
+
+def test_a_map_too_wide_for_a_geotiff_is_still_a_map(tmp_path: Path) -> None:
+    written = write_terrain(tmp_path, np.concatenate([hill(), [[1e6, 1e6, 0.0]]]), TerrainSettings(max_cells=10_000))
+    assert "no elevation.tif" in written and "terrain.cell_m" in written
+    assert cv2.imread(str(tmp_path / "map.pgm"), cv2.IMREAD_UNCHANGED).size <= 10_000

@@ -188,8 +188,7 @@ def export(
     target, folder = MapFolder.open(map_folder), out or map_folder
     settings = (load_settings(config) if config else target.settings).terrain
     check_writable(folder)
-    missing = export_terrain(target, settings, folder)
-    typer.echo(f"{folder}: map.yaml, map.pgm" + (f"; {missing}" if missing else ", elevation.tif"))
+    typer.echo(f"{folder}: {export_terrain(target, settings, folder)}")
 
 
 def _new_recordings(target: MapFolder, bags: list[Bag], console: Console) -> dict[str, Path]:
@@ -253,4 +252,6 @@ def _print_summary(out: Path, summary: dict[str, Any], console: Console) -> None
     console.print(f"{out}: {sentence(summary)}", markup=False, soft_wrap=True)
     if line := crispness(summary):
         console.print(line)
+    if ground := summary.get("ground"):
+        console.print(f"{out}: {ground}", markup=False, soft_wrap=True)
     console.print(f"{out / 'report.html'}", markup=False, soft_wrap=True)

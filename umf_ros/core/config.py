@@ -209,6 +209,12 @@ class TerrainSettings(Group):
     max_step_m: float = Field(0.25, gt=0, description="highest step between neighbouring cells that is free, m")
     max_roughness_m: float = Field(0.1, gt=0, description="largest deviation of the ground from a plane, m")
     clearance_m: float = Field(2.0, gt=0, description="height above the ground from which on nothing is in the way, m")
+    max_cells: int = Field(
+        25_000_000,
+        ge=10_000,
+        description="max cells of the published grid, beyond which it is cropped around the rover, and of map.pgm, "
+        "beyond which its cells get wider",
+    )
     period_s: float = Field(2.0, gt=0, description="shortest time between two publications, s")
     max_bytes_per_s: float = Field(1e6, gt=0, description="largest mean rate of cloud and grid together, bytes/s")
 

@@ -58,9 +58,9 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
         write_tum(trajectories / f"{one.session.name}.tum", Trajectory(one.stamps, one.poses))
     joint.graph.write_g2o(path / "graph.g2o")
     _draw(path / "trajectories.png", joint)
-    found = write_cloud(folder, joint) if folder.places.is_file() else dict.fromkeys(THICKNESS, nan)
+    found, ground = write_cloud(folder, joint) if folder.places.is_file() else (dict.fromkeys(THICKNESS, nan), "")
     thickness = {name: None if isnan(value) else round(value, 4) for name, value in found.items()}
-    summary = summarise(joint) | {"thickness_m": thickness, "world": None}
+    summary = summarise(joint) | {"thickness_m": thickness, "ground": ground, "world": None}
     if joint.world is not None:
         world_T_map, origin = joint.world
         summary["world"] = {"origin": origin.tolist(), "world_T_map": world_T_map.tolist()}
@@ -206,12 +206,12 @@ def merge(scans: list[PlacedScan], sessions: NDArray[np.uint8]) -> NDArray[np.vo
     return cloud
 
 
-def write_cloud(folder: MapFolder, joint: JointMap) -> dict[str, float]:
+def write_cloud(folder: MapFolder, joint: JointMap) -> tuple[dict[str, float], str]:
     """Write `map.ply`, `map.pcd`, the picture `map.png` and the files of `write_terrain`.
 
     Returns:
         Thickness of surfaces in m: "before", by the odometry of every session alone; "with_moving", by the joint graph;
-        "after", without moving objects.
+        "after", without moving objects. Then, what `write_terrain` returns.
     """
     solved, driven = Poses(), Poses()
     for one in joint.sessions:
@@ -234,13 +234,13 @@ def write_cloud(folder: MapFolder, joint: JointMap) -> dict[str, float]:
         if png is not None:
             with atomic_write(folder.path / "map.png") as part:
                 part.write_bytes(png)
-    write_terrain(folder.path, voxels.points().astype(float), folder.settings.terrain, joint.world)
+    ground = write_terrain(folder.path, voxels.points(), folder.settings.terrain, joint.world)
     before = thickness(thin(merge(*gather(folder, driven))))
-    return {"before": before, "with_moving": thickness(thin(everything)), "after": thickness(thinned)}
+    return {"before": before, "with_moving": thickness(thin(everything)), "after": thickness(thinned)}, ground
 
 
 def export_terrain(folder: MapFolder, settings: TerrainSettings, out: Path) -> str:
-    """Write the files of the ground of a solved map into a folder; return what could not be written, as a sentence.
+    """Write the files of the ground of a solved map into a folder; return their names, and what was limited.
 
     Raises:
         UmfError: the map has not been solved.
@@ -251,7 +251,7 @@ def export_terrain(folder: MapFolder, settings: TerrainSettings, out: Path) -> s
     with reading(folder.path / "summary.json", UmfError, "is damaged"):
         world = json.loads((folder.path / "summary.json").read_text(encoding="utf-8")).get("world")
     placed = None if world is None else (np.array(world["world_T_map"]), np.array(world["origin"]))
-    return write_terrain(out, voxels.points().astype(float), settings, placed)
+    return write_terrain(out, voxels.points(), settings, placed)
 
 
 def write_points(path: Path, cloud: NDArray[np.void]) -> None:

@@ -25,7 +25,7 @@ from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.sensors.decode import OdometrySample, decode_pose, stamp_ns
 from umf_ros.sensors.topic_finder import BACK_END
-from umf_ros.terrain.grid import TerrainGrid, make_grid, write_terrain
+from umf_ros.terrain.grid import TerrainGrid, TerrainTiles, make_grid, write_terrain
 from umf_ros.terrain.voxels import LivingMap
 
 SCAN_DEPTH, QUEUE = 50, 10_000
@@ -45,7 +45,7 @@ class MapNode(BaseNode):
         self._map = LivingMap(self._settings.terrain)
         self._path: PathMessage | None = None
         self._version, self._sent = 0, {"cloud": 0, "grid": 0}
-        self._due_s, self._bytes = 0.0, 0
+        self._due_s, self._bytes, self._cropped = 0.0, 0, ""
         self._publishers_of: dict[str, Any] = {
             "cloud": self.create_publisher(PointCloud2, "~/map_cloud", LATCHED_QOS),
             "grid": self.create_publisher(OccupancyGrid, "~/map_grid", LATCHED_QOS),
@@ -110,7 +110,7 @@ class MapNode(BaseNode):
             if name == "cloud":
                 message: Any = to_cloud(points, ["x", "y", "z"], header)
             else:
-                message = to_grid(make_grid(points.astype(float), self._settings.terrain), header)
+                message = to_grid(self._limited(make_grid(points, self._settings.terrain)), header)
             self._publishers_of[name].publish(message)
             self._sent[name] = self._version
             sent += len(message.data) * readers[name]
@@ -118,15 +118,22 @@ class MapNode(BaseNode):
         pause_s = max(terrain.period_s, sent / terrain.max_bytes_per_s, RESTING * (time.thread_time() - began_s))
         self._due_s, self._bytes = time.monotonic() + pause_s, self._bytes + sent
 
+    def _limited(self, tiles: TerrainTiles) -> TerrainGrid:
+        """Return the ground in `terrain.max_cells` around the rover; say so where that is not all of it."""
+        grid = tiles.around(self._map.position[:2], self._settings.terrain.max_cells)
+        self._cropped = grid.describe(tiles) if grid.cells.size < tiles.shape.prod() else ""
+        if self._cropped and self._is_due("cropped", 300.0):
+            self.get_logger().warning(f"map_grid shows only the surroundings of the rover: {self._cropped}")
+        return grid
+
     def _save(self) -> str:
         self._update()
         folder = Path(self._results or "map_results")
         folder.mkdir(parents=True, exist_ok=True)
-        points = self._map.voxels.points().astype(float)
+        points = self._map.voxels.points()
         if not len(points):
             raise UmfError("nothing to write: no scan has a place in the map yet")
-        missing = write_terrain(folder, points, self._settings.terrain)
-        return f"map.yaml and map.pgm written to {folder}" + (f"; {missing}" if missing else ", and elevation.tif")
+        return f"written to {folder}: {write_terrain(folder, points, self._settings.terrain)}"
 
     def _own_status(self) -> DiagnosticStatus:
         scans, odometry = self._map.kept
@@ -138,6 +145,7 @@ class MapNode(BaseNode):
             "odometry_in_memory": odometry,
             "voxels": len(self._map.voxels),
             "rebuilt": self._map.rebuilt,
+            "grid_cropped_to": self._cropped,
             "bytes_published": self._bytes,
             "queue_dropped": self._worker.dropped,
             "executor_stall_max_ms": self._stall_ms,

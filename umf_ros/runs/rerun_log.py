@@ -16,7 +16,7 @@ from umf_ros.core.frames import Frame, Keyframe, State
 from umf_ros.core.geometry import Array
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.runs.run_file import read_absolute_verdicts, read_closures, read_verdicts
-from umf_ros.terrain.grid import FREE, NEAR_LIMIT, OBSTACLE, UNKNOWN, make_grid
+from umf_ros.terrain.grid import FREE, NEAR_LIMIT, OBSTACLE, make_grid
 from umf_ros.terrain.voxels import VoxelMap
 
 if TYPE_CHECKING:
@@ -107,13 +107,10 @@ class RerunLog:
             voxels.add([scan for scan, is_known in zip(scans, known[first : first + BATCH], strict=True) if is_known])
         points = voxels.points()
         if len(points):
-            grid = make_grid(points.astype(float), settings)
-            rows, columns = np.nonzero(grid.cells != UNKNOWN)
-            centres = grid.lower + (np.column_stack([columns, rows]) + 0.5) * grid.cell_m
-            cells = np.column_stack([centres, grid.heights[rows, columns]])
-            colours = [GRID_COLOURS[value] for value in grid.cells[rows, columns].tolist()]
+            cells, values = make_grid(points, settings).known()
+            colours = [GRID_COLOURS[value] for value in values.tolist()]
             self._log.log("map/cloud", rerun.Points3D(points, radii=0.05, colors=[GREY]), static=True)
-            self._log.log("map/grid", rerun.Points3D(cells, radii=grid.cell_m / 2, colors=colours), static=True)
+            self._log.log("map/grid", rerun.Points3D(cells, radii=settings.cell_m / 2, colors=colours), static=True)
         closures = folder / "closures.csv"
         verdicts = read_verdicts(folder / "graph_verdicts.csv", read_closures(closures) if closures.is_file() else ())
         ends = {key: one.state for key, one in verdicts.items()}

@@ -174,6 +174,11 @@ class LivingMap:
         return int(self._placed[-1]) if len(self._placed) else 0
 
     @property
+    def position(self) -> Array:
+        """Position (3,) of the rover at the newest scan in the map, m; the origin without any."""
+        return self._poses[-1, :3, 3] if len(self._poses) else np.zeros(3)
+
+    @property
     def waiting(self) -> int:
         """Number of scans without a place in the map."""
         return len(self._scans) - len(self._placed)
