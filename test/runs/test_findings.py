@@ -13,12 +13,12 @@ from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, traverse, write_mcap
 
 from umf_ros.bags.inputs import Advice, useless_inputs
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.sensor_check import Disagreement, Overlay, SensorReport
 from umf_ros.core.config import load_settings
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import ClosureReason, State
 from umf_ros.runs.findings import USELESS, conclude, look_first
 from umf_ros.runs.truth import JudgedRun
+from umf_ros.sensors.sensor_check import Disagreement, Overlay, SensorReport
 from umf_ros.verification import RejectReason
 
 

@@ -228,7 +228,7 @@ def measured_offset(bag: Bag, sensor: str, seconds: float) -> float | None:
     images = {topics.left_image, topics.right_image, topics.left_info, topics.right_info}
     seen = check_sensors(ChangedBag(bag, _late({topics.cloud} if sensor == "lidar" else images, seconds)), settings)
     found = seen.lidar if sensor == "lidar" else seen.camera
-    return None if found is None else -found.lag_s
+    return None if found is None or found.lag_s is None else -found.lag_s
 
 
 def print_findings(path: Path) -> bool:

@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.sensor_check import MIN_PAIRS, SensorCheck, SensorReport, Step, compare_motion
 from umf_ros.core.config import load_settings
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import make_pose, transform
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.decode import OdometrySample
+from umf_ros.sensors.motion_check import MIN_PAIRS, Step, compare_motion
+from umf_ros.sensors.sensor_check import SensorCheck, SensorReport
 
 
 def stamps(*seconds: float) -> list[int]:
