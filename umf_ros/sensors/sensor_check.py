@@ -219,6 +219,7 @@ def _describe(subject: str, one: Disagreement, mounting: Array | None) -> Contra
         what = f"the {sensor}'s axes are left-handed{along or ' or upside down'}, by motion"
         return Contradiction(subject, what, f"correct the coordinates in its driver; {BODY_AXES}")
     assert one.mounting_deg is not None
+    turned = describe_turn(one.mounting_deg)
     if subject == "odometry":
         what = (
             f"the odometry is not that of the body: by the sensors it is rotated by {describe_turn(one.mounting_deg)}"
