@@ -3,7 +3,7 @@
     python benchmarks/accuracy/planted_faults.py data/demo_seed1.mcap --out /tmp/planted
     python benchmarks/accuracy/planted_faults.py data/demo_seed1.mcap --offsets  # what clocks are measured to be off
     python benchmarks/accuracy/planted_faults.py *.mcap --good  # what is said of recordings as they are
-    python benchmarks/accuracy/planted_faults.py *.mcap --axes  # when impossible axes are named, which withholds closures
+    python benchmarks/accuracy/planted_faults.py *.mcap --axes  # when impossible axes are named
 
 Each run must name its own fault, and the run without a fault none.
 """

@@ -103,6 +103,20 @@ def faults(settings: Settings) -> list[Planted]:
     ]
 
 
+def _lidar_axes(topic_of_cloud: str, axes: np.ndarray) -> Change:
+    def change(topic: str, message: Any) -> Any:
+        if topic == topic_of_cloud:
+            records = np.frombuffer(message.data, np.uint8).reshape(-1, message.point_step).copy()
+            places = [next(one.offset for one in message.fields if one.name == name) for name in "xyz"]
+            points = np.hstack([records[:, at : at + 4].copy().view("<f4") for at in places]) @ axes.T
+            for at, column in zip(places, points.astype("<f4").T, strict=True):
+                records[:, at : at + 4] = np.ascontiguousarray(column)[:, None].view(np.uint8)
+            message.data = records.ravel()
+        return message
+
+    return change
+
+
 def axes_faults(settings: Settings) -> list[Planted]:
     """Impossible axes and mountings, and none; the words are those of the contradiction."""
     topics = topics_of(settings)
@@ -110,17 +124,10 @@ def axes_faults(settings: Settings) -> list[Planted]:
     optical = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
     def lidar(axes: np.ndarray) -> Change:
-        def change(topic: str, message: Any) -> Any:
-            if topic == topics.cloud:
-                records = np.frombuffer(message.data, np.uint8).reshape(-1, message.point_step).copy()
-                places = [next(one.offset for one in message.fields if one.name == name) for name in "xyz"]
-                points = np.hstack([records[:, at : at + 4].copy().view("<f4") for at in places]) @ axes.T
-                for at, column in zip(places, points.astype("<f4").T, strict=True):
-                    records[:, at : at + 4] = np.ascontiguousarray(column)[:, None].view(np.uint8)
-                message.data = records.ravel()
-            return message
+        return _lidar_axes(topics.cloud, axes)
 
-        return change
+    def never(pose: np.ndarray) -> np.ndarray:
+        return make_pose(np.eye(3), pose[:3, 3])
 
     def odometry(turn: Callable[[np.ndarray], np.ndarray]) -> Change:
         def change(topic: str, message: Any) -> Any:
@@ -147,7 +154,7 @@ def axes_faults(settings: Settings) -> list[Planted]:
     def about(axis: str, degrees: float) -> np.ndarray:
         return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
 
-    off = ("LiDAR's mounting is off",)
+    off, seen = ("LiDAR's mounting is off",), ("camera's mounting is off",)
     return [
         Planted("none", ()),
         Planted("LiDAR upside down", off, lidar(down)),

@@ -22,7 +22,8 @@ MIN_PAIRS = 30  # by hand: least pairs of consecutive frames for a clock
 MIN_AXES_PAIRS = 8  # by hand: least pairs of consecutive frames for axes; their evidence is measured
 LAGS_S = np.arange(-1.5, 1.51, 0.05)  # by hand: with a larger offset there are no frames
 NOISE_RAD = 0.005  # measured on simulated drives: sigma of the rotation between consecutive scans
-NOISE_DIRECTION = 0.12  # measured on simulated drives: sigma of the direction of a quarter of a metre, rad
+NOISE_DIRECTION = 0.3  # by hand: sigma of the direction of a quarter of a metre, rad, with errors that all steps share
+OWN_DIRECTION = 0.12  # measured on simulated drives: sigma without these, which `IMPOSSIBLE_RAD` covers, rad
 REST_M = 0.03  # by hand: shorter motion has no direction
 SAME_LENGTH = 2.0  # by hand: largest ratio of the lengths of a scan's motion and the odometry's; else scans have slid
 ROUNDS = 5  # of reweighting
@@ -310,6 +311,8 @@ def fit_axes(seen: Array, stated: Array, sign: int = 1) -> AxesFit:
 
 def _impossible_axes(seen: Array, stated: Array) -> tuple[Array, bool | None] | None:
     """Return mounting (3,) in deg and mirroring if no axes within `IMPOSSIBLE_RAD` of right ones explain the motion."""
+    units = np.array([1, NOISE_DIRECTION / OWN_DIRECTION])[:, None, None]
+    seen, stated = seen * units, stated * units
     fits = [fit_axes(seen, stated, sign) for sign in (1, -1)]
     scales = np.minimum(fits[0].scales, fits[1].scales)
 
