@@ -132,7 +132,11 @@ def axes_faults(settings: Settings) -> list[Planted]:
     def odometry(turn: Callable[[np.ndarray], np.ndarray]) -> Change:
         def change(topic: str, message: Any) -> Any:
             if topic == topics.odometry:
-                pose, at, q = turn(decode_pose(message.pose.pose)), *vars(message.pose.pose).values()
+                pose, at, q = (
+                    turn(decode_pose(message.pose.pose)),
+                    message.pose.pose.position,
+                    message.pose.pose.orientation,
+                )
                 at.x, at.y, at.z = map(float, pose[:3, 3])
                 q.x, q.y, q.z, q.w = map(float, to_quaternion(pose))
             return message
@@ -175,7 +179,7 @@ def axes_faults(settings: Settings) -> list[Planted]:
         Planted(
             "camera off by 90 deg", ("camera's mounting is off",), calibration=camera(lambda it: it @ about("z", 90))
         ),
-        Planted("camera with body axes", ("camera's mounting is off",), calibration=camera(lambda it: np.eye(3))),
+        Planted("camera with body axes", seen, calibration=camera(lambda it: np.eye(3))),
     ]
 
 

@@ -32,7 +32,7 @@ BETTER = 0.75  # by hand: residual at another lag over that at lag 0, below whic
 CONTRAST = 0.6  # by hand: residual at the best lag over the median one, above which the lag is unknown
 IMPOSSIBLE_RAD = np.radians(10)  # by hand: errors of right mountings reach 3.3 deg on simulated drives
 EVIDENCE = 10.0  # by hand: least log-likelihood ratio, nats, of wrong axes to all that are right within this angle
-UNTURNED_RAD = 0.3  # by hand: rotation by the sensor while the odometry's orientation is constant
+UNTURNED_RAD = 0.2  # by hand: rotation by the sensor while the odometry's orientation is constant
 MAX_CLIMB_PX, CLIMB_PX = 20.0, 0.2  # by hand: largest vertical shift of a stereo pair, and least noise of it
 MEDIAN_OF_THREE = 1.538  # median length of a vector of three standard normal numbers
 
@@ -205,9 +205,10 @@ def compare_motion(steps: list[Step], odometry: Trajectory, search_clock: bool =
     if pairs is None:
         return None
     seen, stated = pairs
-    turned_rad = float(np.linalg.norm(seen[0].sum(axis=0))) * NOISE_RAD
-    if turned_rad > UNTURNED_RAD and not stated[0].any():
-        return Disagreement(lag_s, None, impossible=True, unturned_deg=float(np.degrees(turned_rad)))
+    if not stated[0].any():
+        turned_rad = float(np.linalg.norm(seen[0].sum(axis=0))) * NOISE_RAD
+        is_unturned = turned_rad > UNTURNED_RAD
+        return Disagreement(lag_s, None, impossible=is_unturned, unturned_deg=np.degrees(turned_rad) * is_unturned)
     if (impossible := _impossible_axes(seen, stated)) is not None:
         return Disagreement(lag_s, *impossible, impossible=True)
     fit = fit_axes(seen, stated)
