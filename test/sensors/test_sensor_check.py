@@ -115,7 +115,7 @@ def without_camera(frame: Frame) -> Frame:
         (lidar_otherwise, turn("y", 20), "lidar", "mounting is off by "),
         (lidar_otherwise, OPTICAL, "lidar", "mounting is off by 1"),
         (odometry_otherwise, NORTH_EAST_DOWN, "odometry", "is rotated by 1"),
-        (odometry_otherwise, Y_MIRRORED, "odometry", "the odometry's axes are left-handed: mirrored along its y"),
+        (odometry_otherwise, Y_MIRRORED, "odometry", "the odometry's axes are left-handed: mirrored along y"),
         (odometry_otherwise, OPTICAL.T, "odometry", "is rotated by 1"),
         (never_turned, np.eye(3), "odometry", "orientation is constant"),
         (camera_otherwise, turn("z", 90), "camera", "the camera's mounting is off by 9"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import nan
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import small_gicp
@@ -120,7 +120,7 @@ MOVES_M, TURNS_RAD = 0.03, np.radians(0.5)  # by hand: steps with less motion ca
 STRAIGHT_EVERY = 4  # by hand: steps that only translate determine one direction, so a few of them suffice
 DEPTH_EVERY, DEPTH_FRAMES, DEPTH_POINTS = 4, 60, 400  # by hand: bounds the time; images too are of every 4th frame
 DEPTH_RANGE_M = (2.0, 15.0)  # by hand: where a third of a pixel is a few per cent of the depth
-DELAY_S, SURE = 0.01, 5.0  # measured: delays of simultaneous images are below 0.3 ms; by hand: least deviations
+DELAY_S, SURE = 0.02, 5.0  # measured: delays of simultaneous images are below 0.3 ms; by hand: least deviations
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,9 +153,6 @@ class SensorReport:
 
 
 SENSORS = {"lidar": "LiDAR", "camera": "camera"}
-MOUNTING_DEG = 6.0
-"""Least rotation that is reported (*measured* on simulated drives: errors of right mountings reach 3.3 deg, the largest
-about the vertical)."""
 SAME_RAD = {False: np.radians(5), True: np.radians(15)}
 """By hand: largest difference of two sensors' rotations that is attributed to the odometry, also of impossible ones."""
 EXACT_RAD = np.radians(6)
@@ -180,17 +177,17 @@ class Contradiction(NamedTuple):
 
 def find_contradictions(seen: SensorReport, impossible: bool = True) -> list[Contradiction]:
     """Return errors of axes, mountings and exposure by motion, only `impossible` ones or all that are noticed."""
-    off = {name: one for name in SENSORS if (one := getattr(seen, name)) is not None and _is_off(one, impossible)}
-    found = [_late_images(seen.right_delay_s)] if seen.right_delay_s else []
+    known = {name: one for name in SENSORS if (one := getattr(seen, name)) is not None}
+    off = {name: one for name, one in known.items() if one.impossible or not (impossible or one.is_small)}
     odometry = _blame_odometry(seen, off)
     if odometry is not None:
         off = {"odometry": odometry}
-    return [_describe(name, one, seen.mountings.get(name)) for name, one in off.items()] + found
-
-
-def _is_off(one: Disagreement, impossible: bool) -> bool:
-    is_noticed = one.mounting_deg is not None and np.linalg.norm(one.mounting_deg) > MOUNTING_DEG
-    return one.impossible or bool(is_noticed and not impossible)
+    found = [_describe(name, one, seen.mountings.get(name)) for name, one in off.items()]
+    if late_s := seen.right_delay_s:
+        what = f"right images were exposed about {abs(late_s):.2f} s {'after' if late_s > 0 else 'before'} left ones"
+        remedy = "correct trigger or pairing in the camera's driver: stereo depth is wrong"
+        found.append(Contradiction("camera", f"{what} of the same stamp", remedy))
+    return found
 
 
 def _blame_odometry(seen: SensorReport, off: dict[str, Disagreement]) -> Disagreement | None:
@@ -215,15 +212,13 @@ def _describe(subject: str, one: Disagreement, mounting: Array | None) -> Contra
         what = f"the odometry's orientation is constant while the rover turns by {one.unturned_deg:.0f} deg"
         return Contradiction(subject, what, "fill pose.pose.orientation in its driver, or name another odometry")
     if one.mirrored or (one.mirrored is None and one.axes[2, 2] < 0):
-        along = f": mirrored along its {_mirrored_axis(stated.T @ one.axes @ stated)}" if one.mirrored else ""
+        along = f": mirrored along {_mirrored_axis(stated.T @ one.axes @ stated)}" if one.mirrored else ""
         what = f"the {sensor}'s axes are left-handed{along or ' or upside down'}, by motion"
         return Contradiction(subject, what, f"correct the coordinates in its driver; {BODY_AXES}")
     assert one.mounting_deg is not None
     turned = describe_turn(one.mounting_deg)
     if subject == "odometry":
-        what = (
-            f"the odometry is not that of the body: by the sensors it is rotated by {describe_turn(one.mounting_deg)}"
-        )
+        what = f"the odometry is not that of the body: by the sensors it is rotated by {turned}"
         remedy = "name the frame of the poses (--odometry-frame camera, imu or lidar); a topic must be that of the body"
         return Contradiction(subject, what, f"{remedy}: {BODY_AXES}")
     what = f"the {sensor}'s mounting is off by {turned}, by its motion and the odometry"
@@ -242,18 +237,11 @@ def _nearest_axes(axes: Array, mounting: Array) -> Array:
     return np.asarray(tried[apart.argmin()]) if apart.min() < 2**1.5 * np.sin(EXACT_RAD / 2) else axes
 
 
-def _late_images(delay_s: float) -> Contradiction:
-    order = "after" if delay_s > 0 else "before"
-    what = f"right images were exposed about {abs(delay_s):.2f} s {order} left ones of the same stamp"
-    return Contradiction("camera", what, "correct trigger or pairing in the camera's driver: stereo depth is wrong")
-
-
 def _mirrored_axis(axes: Array) -> str:
-    """Return the axis along which a matrix (3, 3) of determinant -1 mirrors."""
+    """Return the axis along which a matrix (3, 3) of determinant -1 mirrors, or the two that it exchanges."""
     values, vectors = np.linalg.eig(axes)
-    along = vectors[:, np.abs(values + 1).argmin()].real
-    most = int(np.abs(along).argmax())
-    return "xyz"[most] if abs(along[most]) > 0.9 else f"({', '.join(f'{part:.1f}' for part in along)})"
+    along = np.abs(vectors[:, np.abs(values + 1).argmin()])
+    return " and ".join(name for name, part in zip("xyz", along, strict=True) if part > 0.5)
 
 
 def describe_turn(mounting_deg: Array) -> str:
@@ -307,23 +295,19 @@ class SensorCheck:
     def report(self, odometry: Trajectory | None) -> SensorReport:
         """Return the measurements, compared with the odometry as recorded."""
         left, right, returns = (_median(values) for values in (*self._contrasts, self._returns))
-        found = SensorReport(left, right, returns, self._intensity_max, lay_over(self._overlaid))
-        moved = self._motion(odometry, search_clock=True)
-        if odometry is not None:
-            moved["forward"] = _forward(odometry)
-        return replace(found, **moved)
+        forward = None if odometry is None else _forward(odometry)
+        found = replace(self._motion(odometry), forward=forward, overlay=lay_over(self._overlaid))
+        seen = {"left_contrast": left, "right_contrast": right, "returns": returns}
+        return replace(found, intensity_max=self._intensity_max, **seen)
 
-    def _motion(self, odometry: Trajectory | None, search_clock: bool) -> dict[str, Any]:
-        """Return the fields of a report about motion."""
+    def _motion(self, odometry: Trajectory | None, search_clock: bool = True) -> SensorReport:
+        """Return the measurements of motion."""
+        steps, found = (self._scan_steps, self._view_steps), SensorReport(mountings=self._mountings)
+        if odometry is not None:
+            lidar, camera = (compare_motion(one, odometry, search_clock) for one in steps)
+            found = replace(found, lidar=lidar, camera=camera)
         upwards = np.mean(self._upwards, axis=0) if self._upwards else None
-        found: dict[str, Any] = {
-            "upwards": upwards,
-            "mountings": self._mountings,
-            "right_delay_s": _delay(self._delays),
-        }
-        for name, steps in (("lidar", self._scan_steps), ("camera", self._view_steps)):
-            found[name] = None if odometry is None else compare_motion(steps, odometry, search_clock)
-        return found
+        return replace(found, upwards=upwards, right_delay_s=_delay(self._delays))
 
     def compare_depths(self, frame: Frame) -> None:
         """Compare stereo disparities with the scan in the common field of view."""
@@ -358,7 +342,7 @@ class SensorCheck:
         self._odometry += [(one.stamp_ns, one.odom_T_body) for one in (earlier, later) if one.odom_T_body is not None]
         self._step(earlier, later)
         odometry = Trajectory.rising(self._odometry)
-        self.contradictions = find_contradictions(SensorReport(**self._motion(odometry, search_clock=False)))
+        self.contradictions = find_contradictions(self._motion(odometry, search_clock=False))
 
     def _step(self, earlier: Frame, later: Frame) -> None:
         if earlier.points is not None and later.points is not None:
