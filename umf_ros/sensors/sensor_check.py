@@ -297,8 +297,8 @@ class SensorCheck:
         left, right, returns = (_median(values) for values in (*self._contrasts, self._returns))
         forward = None if odometry is None else _forward(odometry)
         found = replace(self._motion(odometry), forward=forward, overlay=lay_over(self._overlaid))
-        seen = {"left_contrast": left, "right_contrast": right, "returns": returns}
-        return replace(found, intensity_max=self._intensity_max, **seen)
+        found = replace(found, returns=returns, intensity_max=self._intensity_max)
+        return replace(found, left_contrast=left, right_contrast=right)
 
     def _motion(self, odometry: Trajectory | None, search_clock: bool = True) -> SensorReport:
         """Return the measurements of motion."""
