@@ -33,6 +33,7 @@ CONTRAST = 0.6  # by hand: residual at the best lag over the median one, above w
 MOUNTING_DEG = 6.0  # measured on simulated drives: errors of right mountings reach 3.3 deg, most about the vertical
 IMPOSSIBLE_RAD = np.radians(10)  # by hand: errors of right mountings reach 3.3 deg on simulated drives
 EVIDENCE = 10.0  # by hand: least log-likelihood ratio, nats, of wrong axes to all that are right within this angle
+RELATED = 0.5  # by hand: largest median misfit over the median size of rotations or directions that are related
 UNTURNED_RAD = 0.2  # by hand: rotation by the sensor while the odometry's orientation is constant
 MAX_CLIMB_PX, CLIMB_PX = 20.0, 0.2  # by hand: largest vertical shift of a stereo pair, and noise of it
 MEDIAN_OF_THREE = 1.538  # median length of a vector of three standard normal numbers
@@ -317,7 +318,7 @@ def _impossible_axes(seen: Array, stated: Array) -> tuple[Array, bool | None] | 
     units = np.array([1, NOISE_DIRECTION / OWN_DIRECTION])[:, None, None]
     seen, stated = seen * units, stated * units
     fits = [fit_axes(seen, stated, sign) for sign in (1, -1)]
-    scales = np.minimum(fits[0].scales, fits[1].scales)
+    scales, norms = np.minimum(fits[0].scales, fits[1].scales), np.linalg.norm(stated, axis=2)
 
     def log_likelihood(rotation: Array, sign: int = 1) -> float:  # of Student's t, as the weights
         misfits = np.stack([seen[0], sign * seen[1]]) @ rotation.T - stated
@@ -332,8 +333,10 @@ def _impossible_axes(seen: Array, stated: Array) -> tuple[Array, bool | None] | 
         near = np.linalg.solve(information / damping + np.eye(3), information / damping @ turn)
         near *= min(1.0, IMPOSSIBLE_RAD / max(float(np.linalg.norm(near)), 1e-9))
         allowed = max(allowed, log_likelihood(Rotation.from_rotvec(near).as_matrix()))
+    sizes = np.array([np.median(lengths[lengths > 0]) if lengths.any() else 0.0 for lengths in norms])
+    is_related = (MEDIAN_OF_THREE * scales[:, 0] < RELATED * sizes).any()
     likelihoods = [log_likelihood(fit.rotation, fit.sign) for fit in fits]
-    if max(likelihoods) < allowed + EVIDENCE:
+    if not is_related or max(likelihoods) < allowed + EVIDENCE:
         return None
     lead = likelihoods[1] - likelihoods[0]
     mirrored = lead > 0 if abs(lead) >= EVIDENCE else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field, replace
 from math import nan
 from typing import NamedTuple
@@ -115,7 +116,8 @@ def lay_over(equations: list[Array]) -> Overlay | None:
 
 MIN_STEP_S, MAX_STEP_S = 0.18, 1.0  # by hand: between frames whose motion is compared
 STEP_S, STEP_M = 0.35, 0.35  # by hand: one of both is reached, as the noise of a step does not grow with it
-MAX_STEPS = 60  # measured: clocks and axes are found as with 150
+MAX_POSES = 3000  # by hand: some minutes; bounds the memory
+MAX_STEPS = 90  # measured: clocks and axes are found as with 150
 MOVES_M, TURNS_RAD = 0.03, np.radians(0.5)  # by hand: steps with less motion carry no information on clocks or axes
 STRAIGHT_EVERY = 4  # by hand: steps that only translate determine one direction, so a few of them suffice
 DEPTH_EVERY, DEPTH_FRAMES, DEPTH_POINTS = 4, 60, 400  # by hand: bounds the time; images too are of every 4th frame
@@ -271,7 +273,7 @@ class SensorCheck:
         self._scan_steps: list[Step] = []
         self._view_steps: list[Step] = []
         self._tried = self._straight = 0
-        self._odometry: list[tuple[int, Array]] = []
+        self._odometry: deque[tuple[int, Array]] = deque(maxlen=MAX_POSES)
         self._upwards: list[Array] = []
         self._delays: list[Array] = []
         self._mountings: dict[str, Array] = {}
@@ -287,6 +289,8 @@ class SensorCheck:
             for image, contrasts in zip((frame.left, frame.right), self._contrasts, strict=True):
                 contrasts += [] if image is None else [float(image[::4, ::4].std())]
             self.compare_depths(frame)
+        if frame.odom_T_body is not None:
+            self._odometry.append((frame.stamp_ns, frame.odom_T_body))
         if self._last is None or frame.session != self._last.session:
             self._last = frame
         elif self._tried < MAX_STEPS:
@@ -339,7 +343,6 @@ class SensorCheck:
         if waited_s > MAX_STEP_S or (is_straight and (moved_m < MOVES_M or self._straight % STRAIGHT_EVERY)):
             return
         self._tried += 1
-        self._odometry += [(one.stamp_ns, one.odom_T_body) for one in (earlier, later) if one.odom_T_body is not None]
         self._step(earlier, later)
         odometry = Trajectory.rising(self._odometry)
         self.contradictions = find_contradictions(self._motion(odometry, search_clock=False))
