@@ -73,7 +73,7 @@ def test_a_lidar_that_is_mounted_otherwise_than_stated_is_found(drive: Drive, ax
 
     seen = checked((bare, drive[1]), spoil)
     assert seen.lidar is not None and seen.lidar.mounting_deg is not None and seen.camera is None
-    np.testing.assert_allclose(seen.lidar.mounting_deg, -np.degrees(turn), atol=4)
+    np.testing.assert_allclose(seen.lidar.mounting_deg, -np.degrees(turn), atol=4.5)
 
 
 def lidar_otherwise(frame: Frame, axes: np.ndarray) -> Frame:
@@ -128,7 +128,7 @@ def test_impossible_axes_are_found_on_the_first_metres(
     check, start_ns = SensorCheck(), drive[0][0].stamp_ns
     for frame in drive[0]:
         check.take(spoil(frame, axes))
-        if frame.stamp_ns - start_ns > 10e9:
+        if frame.stamp_ns - start_ns > 5e9:
             break
     (found,) = check.contradictions
     assert found.subject == subject and words in found.what, found
@@ -137,7 +137,7 @@ def test_impossible_axes_are_found_on_the_first_metres(
 
 def test_the_quaternion_to_paste_is_the_mounting_that_is_right(drive: Drive) -> None:
     check = SensorCheck()
-    for frame in drive[0][:60]:
+    for frame in drive[0][:30]:
         check.take(lidar_otherwise(frame, NORTH_EAST_DOWN))
     numbers = [float(one) for one in check.contradictions[0].remedy.split("[")[1].split("]")[0].split(",")]
     right = NORTH_EAST_DOWN.T @ drive[0][0].body_T_lidar[:3, :3]
@@ -147,7 +147,7 @@ def test_the_quaternion_to_paste_is_the_mounting_that_is_right(drive: Drive) -> 
 def test_without_a_camera_the_ground_tells_a_lidar_upside_down_from_odometry_with_z_down(drive: Drive) -> None:
     for spoil, subject in ((lidar_otherwise, "lidar"), (odometry_otherwise, "odometry")):
         check = SensorCheck()
-        for frame in drive[0][:60]:
+        for frame in drive[0][:30]:
             check.take(spoil(without_camera(frame), NORTH_EAST_DOWN))
         assert [one.subject for one in check.contradictions] == [subject]
 

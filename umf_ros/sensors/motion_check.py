@@ -25,7 +25,7 @@ NOISE_RAD = 0.005  # measured on simulated drives: sigma of the rotation between
 NOISE_DIRECTION = 0.3  # by hand: sigma of the direction of a quarter of a metre, rad, with errors that all steps share
 OWN_DIRECTION = 0.12  # measured on simulated drives: sigma without these, which `IMPOSSIBLE_RAD` covers, rad
 REST_M = 0.03  # by hand: shorter motion has no direction
-SAME_LENGTH = 2.0  # by hand: largest ratio of the lengths of a scan's motion and the odometry's; else scans have slid
+SAME_LENGTH = 1.3  # by hand: largest ratio of the lengths of a scan's motion and the odometry's; else scans have slid
 ROUNDS = 5  # of reweighting
 KNOWN = 0.02  # by hand: least share of the second direction of motion for an observable mounting
 BETTER = 0.75  # by hand: residual at another lag over that at lag 0, below which a clock is reported
@@ -49,12 +49,14 @@ class Step(NamedTuple):
         start_ns, end_ns: their stamps.
         turn: (3,) rotation vector, rad, about the body axes of the calibration.
         shift: (3,) m in these axes, or a unit vector for a single camera, which measures no length.
+        lever: (3,) m in these axes from the body to the point that shifts: the camera; scans are in the body frame.
     """
 
     start_ns: int
     end_ns: int
     turn: Array
     shift: Array
+    lever: Array = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +172,8 @@ def _view_motion(earlier: Frame, later: Frame, before: Array, after: Array) -> S
     mounted = earlier.body_T_camera[:3, :3]
     turned = Rotation.from_matrix(mounted @ turn.T @ mounted.T).as_rotvec()
     assert earlier.image_stamp_ns is not None and later.image_stamp_ns is not None
-    return Step(earlier.image_stamp_ns, later.image_stamp_ns, turned, mounted @ (-turn.T @ shift).ravel())
+    lever, way = earlier.body_T_camera[:3, 3], mounted @ (-turn.T @ shift).ravel()
+    return Step(earlier.image_stamp_ns, later.image_stamp_ns, turned, way, lever)
 
 
 def _delay(climb: Array, stereo: Array, waited_s: float) -> Array | None:
@@ -234,7 +237,9 @@ def _pairs_at(steps: list[Step], odometry: Trajectory, lag_s: float, at_least: i
     first, last = (interpolated(odometry.stamps_ns, odometry.poses, stamps) for stamps in spans_ns[inside].T)
     moved = invert(first) @ last
     turns = np.stack([step.turn for step in steps])[inside], Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()
-    shifts = np.stack([step.shift for step in steps])[inside], moved[:, :3, 3]
+    levers = np.stack([step.lever for step in steps])[inside]
+    shifted = np.einsum("nij,nj->ni", moved[:, :3, :3], levers) + moved[:, :3, 3] - levers
+    shifts = np.stack([step.shift for step in steps])[inside], shifted
     lengths = [np.linalg.norm(one, axis=1, keepdims=True) for one in shifts]
     ratios = lengths[0] / np.maximum(lengths[1], 1e-9)
     is_unit = np.abs(lengths[0] - 1).max() < 1e-6  # of a camera
