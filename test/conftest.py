@@ -32,7 +32,7 @@ MARKED = {
     "browser": ("runs/test_browser.py",),
     "slow": (
         *("lab", "benchmarks", "maps", "submaps", "commands", "verification", "pose_graph", "embedding"),
-        *("baselines", "runs", "test_durable_graph.py", "bags/test_hostile.py", "bags/test_sensor_check.py"),
+        *("baselines", "runs", "test_durable_graph.py", "bags/test_hostile.py", "sensors/test_sensor_check.py"),
         *("test_packaging.py", "test_replay.py", "test_tasks.py", "test_imports.py"),
     ),
 }

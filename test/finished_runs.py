@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.bags.sensor_check import SensorReport
 from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import Array, make_pose, relative
@@ -18,6 +17,7 @@ from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import COLUMNS, KEYFRAME, NAME, RunFile
 from umf_ros.runs.truth import JudgedRun, judge_closures
+from umf_ros.sensors.sensor_check import SensorReport
 from umf_ros.verification import Hypothesis, RejectReason
 
 START_NS = 1_600_000_000 * 10**9

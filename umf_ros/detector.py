@@ -23,8 +23,10 @@ from umf_ros.core.geometry import Array, relative, rotation_angle
 from umf_ros.embedding import Embedder, make_embedder
 from umf_ros.embedding.depth import lift
 from umf_ros.places.database import PlaceDatabase
+from umf_ros.sensors.sensor_check import SensorCheck
 from umf_ros.submaps import SubmapFinder
 from umf_ros.verification import Hypothesis, RejectReason, Verifier, thin_frame
+from umf_ros.verification.hypothesis import IMAGE
 
 if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatcher
@@ -34,6 +36,9 @@ logger = logging.getLogger(__name__)
 Other = TypeVar("Other")
 """Items of a stream beside frames, such as odometry."""
 NOTHING_METRIC = "candidates are reported, but none becomes a loop closure"
+WITHHELD = "closures are withheld"
+FRAMES_AHEAD = 20
+"""Most frames that the sensor check may lag behind; bounds the memory."""
 MOST_HELD = 400
 """Most items of a recording that are read ahead for the next keyframe; bounds the memory (*by hand*)."""
 COUNTED_STEP_M = 0.05
@@ -147,6 +152,7 @@ class LoopDetector:
         database: the rover's places.
         seen: its places while it localises in a map that grows, in sessions of their own; None: they are not kept.
         inter_robot: closures with other rovers of a fleet; None of a rover on its own.
+        sensors: check of all frames, in a thread of its own; what it finds impossible withholds closures.
         embedder_name: name of the network.
         embed_ms: milliseconds that the last embedding took, prefetched or not.
 
@@ -181,6 +187,10 @@ class LoopDetector:
         self._warned_without_depth = False
         self.embed_ms = 0.0
         self._network = ThreadPoolExecutor(1, "embedding")
+        self.sensors = SensorCheck()
+        self._checking = ThreadPoolExecutor(1, "sensor-check")  # OpenCV releases the interpreter lock
+        self._unchecked: deque[Future[None]] = deque()
+        self._named: set[str] = set()
         self._queue: deque[_Upcoming] = deque()
         self._current: _Upcoming | None = None
 
@@ -194,6 +204,7 @@ class LoopDetector:
 
     def process(self, frame: Frame, publish: Callable[[Detection], None] = lambda _: None) -> Detection:
         """Process one frame, in order of stamps within a session; `publish` gets the result before it is stored."""
+        self._check(frame)
         if not self.select(frame):
             return Detection(frame.stamp_ns)
         keyframe = self.embed(frame)
@@ -207,6 +218,7 @@ class LoopDetector:
             verdicts = self.verify(keyframe, candidates)
         with _timed(latency, "submaps"):
             verdicts = self.match_submaps(keyframe, verdicts)
+        self._withhold(verdicts)
         detection = Detection(frame.stamp_ns, keyframe, verdicts, latency | {"total": sum(latency.values())})
         publish(detection)
         try:
@@ -297,7 +309,7 @@ class LoopDetector:
                 self.seen.add(replace(keyframe, session=keyframe.session - self._map.stop))
         elif not stored:
             row = self.database.add(keyframe)
-            if self.inter_robot is not None:
+            if self.inter_robot is not None and not self.sensors.contradictions:
                 self.inter_robot.link.enqueue(row)
         self._submaps.remember(keyframe)
 
@@ -307,6 +319,7 @@ class LoopDetector:
         Returns:
             Whether it is a keyframe.
         """
+        self._check(frame)
         if not self.select(frame):
             return False
         if known := self.database.store.rows_at(frame.stamp_ns):
@@ -320,6 +333,7 @@ class LoopDetector:
     def close(self) -> None:
         """Disconnect from the fleet's server, and release the database, the network and the scans."""
         self._network.shutdown(cancel_futures=True)
+        self._checking.shutdown()
         self._embedder = None
         self._verifier.reset()
         if self.inter_robot is not None:
@@ -332,6 +346,28 @@ class LoopDetector:
         """End the session: the next frame begins a new one; all places are kept."""
         self._session = None
         self._selector.reset()
+
+    def _check(self, frame: Frame) -> None:
+        self._unchecked.append(self._checking.submit(self.sensors.take, frame))
+        self._await_check(FRAMES_AHEAD)
+        for one in self.sensors.contradictions:
+            if one.subject not in self._named:
+                self._named.add(one.subject)
+                logger.error("%s: %s; %s", WITHHELD, one.what, one.remedy)
+
+    def _await_check(self, at_most: int) -> None:
+        while len(self._unchecked) > at_most or (self._unchecked and self._unchecked[0].done()):
+            self._unchecked.popleft().result()
+
+    def _withhold(self, verdicts: Sequence[Hypothesis]) -> None:
+        """Reject closures that rest on axes, mountings or images that the frames so far prove wrong."""
+        accepted = [one for one in verdicts if one.accepted]
+        if accepted:
+            self._await_check(0)  # so that the verdicts do not depend on threads
+        for found in self.sensors.contradictions:
+            for one in accepted:
+                if found.subject != "camera" or one.kind == IMAGE:
+                    one.reject(RejectReason.SENSORS, found.what)
 
     def _warn_without_depth(self, verdicts: Sequence[Hypothesis]) -> None:
         """Warn once that candidates have no metric pose: one camera without a LiDAR measures no depth."""

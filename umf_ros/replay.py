@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import traceback
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from umf_ros.absolute.measurement import AbsoluteMeasurement
-from umf_ros.bags.sensor_check import SensorCheck
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
@@ -25,8 +23,6 @@ from umf_ros.sensors.sessions import OdometrySessionSplitter
 FAULTS = "faults.log"
 WARM_UP = 12
 """Keyframes before an interruption that are processed again: twice the history of the verification."""
-FRAMES_AHEAD = 20
-"""Most frames that the sensor check may lag behind; bounds the memory."""
 FLEET_PATIENCE_S = 30.0
 """Time that a replay waits at its end for a fleet's server; the next run sends the remaining places."""
 
@@ -42,7 +38,6 @@ class Replay:
         settings: all settings.
         detector: made with these settings, or with the database of the run that is resumed.
         resume: continue an earlier replay of the same recording into this folder.
-        sensor_check: takes every frame, if given.
 
     Attributes:
         faults: frames that were skipped after internal errors; `faults.log` in the folder has the tracebacks.
@@ -54,23 +49,13 @@ class Replay:
         UmfError: the map has not been solved, or is damaged.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        settings: Settings,
-        detector: LoopDetector,
-        resume: bool = False,
-        sensor_check: SensorCheck | None = None,
-    ) -> None:
+    def __init__(self, folder: Path, settings: Settings, detector: LoopDetector, resume: bool = False) -> None:
         self._folder = folder
         self._detector = detector
         self._localizer = open_localizer(settings) if settings.localizing else None
         self._graph = self._localizer or PoseGraph(settings.pose_graph)
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometrySessionSplitter(self._graph)
-        self._sensor_check = sensor_check
-        self._checking = ThreadPoolExecutor(1, "sensor-check")  # OpenCV releases the interpreter lock
-        self._unchecked: deque[Future[None]] = deque()
         self.faults = 0
         self.counts: dict[str, Any] = {"keyframes": 0, "keyframes_until_found": None, "located": 0}
         self.counts |= {"relocalised": 0, "agreed": 0, "contradicted": 0}
@@ -100,8 +85,6 @@ class Replay:
                 self._graph.add_absolute(item)
                 self._graph.update()
                 continue
-            if self._sensor_check is not None:
-                self._check_sensors(self._sensor_check, item)
             if self._done > WARM_UP:
                 yield self._skip_known(item)
                 continue
@@ -117,11 +100,6 @@ class Replay:
             yield detection
             if detection.fault is not None:
                 raise detection.fault
-
-    def _check_sensors(self, check: SensorCheck, frame: Frame) -> None:
-        self._unchecked.append(self._checking.submit(check.take, frame))
-        while len(self._unchecked) > FRAMES_AHEAD or (self._unchecked and self._unchecked[0].done()):
-            self._unchecked.popleft().result()
 
     def _process(self, frame: Frame) -> Detection:
         """Return the result of a frame, without a keyframe after an internal error."""
@@ -202,5 +180,4 @@ class Replay:
         write_summary(self._folder, self._recorder.summary(drops) | known)
         self._recorder.close()
         self._detector.close()
-        self._checking.shutdown()
         return has_trajectory

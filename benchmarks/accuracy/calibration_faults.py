@@ -16,13 +16,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from umf_ros.bags.sensor_check import DEPTH_EVERY, DEPTH_FRAMES, SensorCheck
 from umf_ros.core.frames import Frame, ScanMotion
 from umf_ros.core.geometry import make_pose, relative, transform
 from umf_ros.lab.simulation.presets import find_preset
 from umf_ros.lab.simulation.simulator import Simulator
 from umf_ros.runs.findings import about_sensors
 from umf_ros.sensors.assembly import twists
+from umf_ros.sensors.sensor_check import DEPTH_EVERY, DEPTH_FRAMES, SensorCheck
 
 FAULTS = {"none": "", "baseline 1 %": "baseline is wrong", "turn 1 deg": "mounting is wrong", "clock 20 ms": "clock is"}
 """Words of the line that is about a fault."""

@@ -3,6 +3,7 @@
     python benchmarks/accuracy/planted_faults.py data/demo_seed1.mcap --out /tmp/planted
     python benchmarks/accuracy/planted_faults.py data/demo_seed1.mcap --offsets  # what clocks are measured to be off
     python benchmarks/accuracy/planted_faults.py *.mcap --good  # what is said of recordings as they are
+    python benchmarks/accuracy/planted_faults.py *.mcap --axes  # when impossible axes are named
 
 Each run must name its own fault, and the run without a fault none.
 """
@@ -15,10 +16,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
-from support.planted_faults import first_sentences, measured_offset, print_findings
+from support.planted_faults import (
+    axes_faults,
+    first_contradiction,
+    first_sentences,
+    measured_offset,
+    print_findings,
+)
 
 OFFSETS_S = (-1.0, -0.5, -0.2, -0.1, 0.0, 0.1, 0.2, 0.5, 1.0)
 
@@ -35,6 +43,20 @@ def print_offsets(path: Path, sensors: Sequence[str]) -> bool:
     return good
 
 
+def print_axes(path: Path, out: Path, only: str) -> bool:
+    """Print when impossible axes are named; returns whether all are before the first closure, and none without one."""
+    bag, wrong = open_bag(path), 0
+    settings = settings_for(bag, None, "auto")
+    for fault in axes_faults(settings):
+        if only not in fault.name:
+            continue
+        after_s, what = first_contradiction(bag, fault, out / "axes", settings.loop.min_time_gap_s)
+        right = all(word in what for word in fault.words) and bool(what) == bool(fault.words)
+        wrong += not right
+        print(f"{'ok  ' if right else 'MISS'} {path.stem} {fault.name}: {after_s:.1f} s, {what or '-'}", flush=True)
+    return not wrong
+
+
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -45,7 +67,10 @@ def main() -> None:
     parser.add_argument("--offsets", action="store_true", help="only measure clock offsets of -1 to 1 s")
     parser.add_argument("--sensors", default="lidar,camera", help="sensors whose clocks are shifted")
     parser.add_argument("--good", action="store_true", help="only check recordings without faults")
+    parser.add_argument("--axes", action="store_true", help="only check when impossible axes are named")
     given = parser.parse_args()
+    if given.axes:
+        sys.exit(not all([print_axes(path, given.out / path.stem, given.only) for path in given.bags]))
     if given.offsets:
         sys.exit(not all([print_offsets(path, given.sensors.split(",")) for path in given.bags]))
     if given.good:

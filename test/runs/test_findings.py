@@ -13,12 +13,13 @@ from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, traverse, write_mcap
 
 from umf_ros.bags.inputs import Advice, useless_inputs
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.sensor_check import Disagreement, Overlay, SensorReport
 from umf_ros.core.config import load_settings
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import ClosureReason, State
 from umf_ros.runs.findings import USELESS, conclude, look_first
 from umf_ros.runs.truth import JudgedRun
+from umf_ros.sensors.motion_check import Disagreement
+from umf_ros.sensors.sensor_check import Overlay, SensorReport
 from umf_ros.verification import RejectReason
 
 
@@ -197,7 +198,10 @@ def laid_over(scale: float) -> Overlay:
         (SensorReport(intensity_max=0.0), "all intensities are 0"),
         (SensorReport(overlay=laid_over(1.5)), "stereo depth is 1.5 times that of the LiDAR"),
         (SensorReport(lidar=LIDAR, camera=FINE), "the LiDAR's mounting is off by 9 deg, mostly about y (+9 deg)"),
-        (SensorReport(lidar=LIDAR, camera=LIDAR), "the odometry is not that of the body: by camera"),
+        (
+            SensorReport(lidar=LIDAR, camera=LIDAR),
+            "the odometry is not that of the body: by the sensors",
+        ),
         (SensorReport(forward=np.array([0, 0, 0.9])), "the odometry is not that of the body: it moves along"),
         (SensorReport(lidar=Disagreement(-0.5, None), camera=FINE), "the LiDAR's clock is about +0.5 s off"),
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from collections.abc import Callable, Collection, Iterator
@@ -11,17 +12,21 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
+from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, RawMessage, message_types, open_bag
 from umf_ros.bags.trajectories import read_ground_truth
-from umf_ros.core.config import Settings, load_preset, topics_of
-from umf_ros.core.geometry import from_quaternion, to_quaternion
+from umf_ros.core.config import Settings, load_preset, load_settings, topics_of
+from umf_ros.core.frames import Frame
+from umf_ros.core.geometry import from_quaternion, make_pose, to_quaternion
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.lab.evaluation.inspection import check_sensors
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.runs.findings import about_sensors
 from umf_ros.sensors.decode import decode_pose
+from umf_ros.sensors.sensor_check import SensorCheck
 
 Change = Callable[[str, Any], Any]
 """From topic and message to the message that is recorded instead; None drops it."""
@@ -96,6 +101,103 @@ def faults(settings: Settings) -> list[Planted]:
         Planted("all closures pending", ("all closures are pending",), options=_short_odometry),
         Planted("truth of another clock", ("ground truth has another clock",), options=_other_clock),
     ]
+
+
+def _lidar_axes(topic_of_cloud: str, axes: np.ndarray) -> Change:
+    def change(topic: str, message: Any) -> Any:
+        if topic == topic_of_cloud:
+            records = np.frombuffer(message.data, np.uint8).reshape(-1, message.point_step).copy()
+            places = [next(one.offset for one in message.fields if one.name == name) for name in "xyz"]
+            points = np.hstack([records[:, at : at + 4].copy().view("<f4") for at in places]) @ axes.T
+            for at, column in zip(places, points.astype("<f4").T, strict=True):
+                records[:, at : at + 4] = np.ascontiguousarray(column)[:, None].view(np.uint8)
+            message.data = records.ravel()
+        return message
+
+    return change
+
+
+def axes_faults(settings: Settings) -> list[Planted]:
+    """Impossible axes and mountings, and none; the words are those of the contradiction."""
+    topics = topics_of(settings)
+    down, mirrored, exchanged = np.diag([1.0, -1, -1]), np.diag([1.0, -1, 1]), np.eye(3)[[0, 2, 1]]
+    optical = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+
+    def lidar(axes: np.ndarray) -> Change:
+        return _lidar_axes(topics.cloud, axes)
+
+    def never(pose: np.ndarray) -> np.ndarray:
+        return make_pose(np.eye(3), pose[:3, 3])
+
+    def odometry(turn: Callable[[np.ndarray], np.ndarray]) -> Change:
+        def change(topic: str, message: Any) -> Any:
+            if topic == topics.odometry:
+                pose, at, q = (
+                    turn(decode_pose(message.pose.pose)),
+                    message.pose.pose.position,
+                    message.pose.pose.orientation,
+                )
+                at.x, at.y, at.z = map(float, pose[:3, 3])
+                q.x, q.y, q.z, q.w = map(float, to_quaternion(pose))
+            return message
+
+        return change
+
+    def other_axes(axes: np.ndarray) -> Change:
+        around = make_pose(axes, np.zeros(3))
+        return odometry(lambda pose: around @ pose @ around.T)
+
+    def camera(turn: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict[str, Any]], None]:
+        def change(calibration: dict[str, Any]) -> None:
+            pose = calibration["body_T_camera"]
+            wrong = turn(from_quaternion((0, 0, 0), pose["quaternion"])[:3, :3])
+            pose["quaternion"] = [float(one) for one in to_quaternion(make_pose(wrong, np.zeros(3)))]
+
+        return change
+
+    def about(axis: str, degrees: float) -> np.ndarray:
+        return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+
+    off, seen = ("LiDAR's mounting is off",), ("camera's mounting is off",)
+    return [
+        Planted("none", ()),
+        Planted("LiDAR upside down", off, lidar(down)),
+        Planted("LiDAR off by 90 deg", off, lidar(about("z", 90))),
+        Planted("LiDAR off by 45 deg", off, lidar(about("x", 45))),
+        Planted("LiDAR off by 20 deg", off, lidar(about("z", 20))),
+        Planted("LiDAR with optical axes", off, lidar(optical)),
+        Planted("LiDAR left-handed", ("LiDAR's axes are left-handed",), lidar(mirrored)),
+        Planted("LiDAR y and z exchanged", ("LiDAR's axes are left-handed",), lidar(exchanged)),
+        Planted("odometry NED", ("odometry is not that of the body",), other_axes(down)),
+        Planted("odometry optical", ("odometry is not that of the body",), other_axes(optical.T)),
+        Planted("odometry left-handed", ("odometry's axes are left-handed",), other_axes(mirrored)),
+        Planted(
+            "odometry never turns",
+            ("orientation is constant",),
+            odometry(lambda pose: make_pose(np.eye(3), pose[:3, 3])),
+        ),
+        Planted(
+            "camera off by 90 deg", ("camera's mounting is off",), calibration=camera(lambda it: it @ about("z", 90))
+        ),
+        Planted("camera with body axes", seen, calibration=camera(lambda it: np.eye(3))),
+    ]
+
+
+def first_contradiction(bag: Bag, fault: Planted, folder: Path, seconds: float) -> tuple[float, str]:
+    """Return when (s after the first frame) and how a fault is named within so many seconds; infinity if it is not."""
+    settings = settings_for(bag, None, "auto")
+    if fault.calibration is not None:
+        settings = load_settings(plant(fault, bag, {}, folder)[2])
+    check, start_ns, named = SensorCheck(), None, (math.inf, "")
+    stream = FrameReader(ChangedBag(bag, fault.change or (lambda _, message: message)), settings).stream()
+    for frame in (item for item in stream if isinstance(item, Frame)):
+        start_ns = start_ns or frame.stamp_ns
+        if (after_s := (frame.stamp_ns - start_ns) * 1e-9) > seconds:
+            break
+        check.take(frame)
+        what = "; ".join(one.what for one in check.contradictions)
+        named = (min(named[0], after_s), what) if what else (math.inf, "")
+    return named
 
 
 def _late(topics: set[str], seconds: float) -> Change:
@@ -228,7 +330,7 @@ def measured_offset(bag: Bag, sensor: str, seconds: float) -> float | None:
     images = {topics.left_image, topics.right_image, topics.left_info, topics.right_info}
     seen = check_sensors(ChangedBag(bag, _late({topics.cloud} if sensor == "lidar" else images, seconds)), settings)
     found = seen.lidar if sensor == "lidar" else seen.camera
-    return None if found is None else -found.lag_s
+    return None if found is None or found.lag_s is None else -found.lag_s
 
 
 def print_findings(path: Path) -> bool:

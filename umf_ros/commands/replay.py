@@ -74,7 +74,6 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.inputs import absent_inputs, input_counts
-    from umf_ros.bags.sensor_check import SensorCheck
     from umf_ros.bags.trajectories import read_ground_truth
     from umf_ros.commands.console import WARNING, FrameProgress, stop_on_interrupt, undisturbed
     from umf_ros.core.watchdog import watching
@@ -103,8 +102,7 @@ def command(
     absent = [one.line for one in absent_inputs(recording, settings, odometry is not None)]
     for line in absent:
         console.print(line, **WARNING)
-    check = None if settings.localizing else SensorCheck()
-    replay = Replay(folder, settings, detector, unfinished is not None, check)
+    replay = Replay(folder, settings, detector, unfinished is not None)
     with stop_on_interrupt() as interrupted, FrameProgress(console, replay.graph_counts) as progress, watching():
         stream = reader.stream()
         for detection in replay.run(viewer.watch(stream) if viewer else stream):
@@ -131,13 +129,13 @@ def command(
             interrupted=bool(interrupted()),
             odometry_file={"path": str(odometry.resolve()), "frame": odometry_frame} if odometry else None,
         )
-        if check is None:
+        if settings.localizing:
             status = _report_localization(console, folder, replay.counts, newest)
         else:
             from umf_ros.runs.report import finish_run  # Matplotlib delays a start
 
             truth = truth or (read_ground_truth(recording) if interrupted() else reader.ground_truth)
-            sensors = check.report(read_odometry_of(folder))
+            sensors = detector.sensors.report(read_odometry_of(folder))
             run = read_run(folder, recording, truth)
             status = finish_run(run, recording, console, sensors, frozenset(warnings + absent)).exit_code
     replay.raise_if_frames_failed()

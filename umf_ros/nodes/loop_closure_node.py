@@ -29,7 +29,7 @@ from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line
 from umf_ros.core.frames import Frame, Keyframe, LoopClosure, State
 from umf_ros.core.geometry import Array, rotation_angle
 from umf_ros.core.io import memory_mb
-from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
+from umf_ros.detector import WITHHELD, Detection, LoopDetector, make_detector_embedder
 from umf_ros.nodes import conversions as messages
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, MAX_LINES, SCAN_FIELDS
@@ -211,6 +211,8 @@ class LoopClosureNode(BaseNode):
             level, text = WARN, "paused"
         elif self._cannot_write:
             level = ERROR
+        elif self._detector.sensors.contradictions:
+            level, text = ERROR, f"{WITHHELD}: {self._detector.sensors.contradictions[0].what}"
         elif self._worker.dropped or self._decoder.dropped:
             level, text = WARN, "too slow: messages are being dropped"
         return status(level, "detector", text, values)

@@ -11,13 +11,12 @@ from typing import Literal
 import numpy as np
 
 from umf_ros.bags.inputs import SEVERITIES, Advice, Severity, absent_inputs, useless_inputs
-from umf_ros.bags.sensor_check import Overlay, SensorReport
 from umf_ros.core.config import Settings
-from umf_ros.core.geometry import Array
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, explain
 from umf_ros.runs.run_file import read_absolute_verdicts
 from umf_ros.runs.truth import JudgedRun, in_words
+from umf_ros.sensors.sensor_check import SENSORS, Overlay, SensorReport, describe_turn, find_contradictions
 
 REFUSED = ("size", "encoding", "step", "truncated", "compressed", "fields", "datatype", "unusable", "stamp")
 """Reasons for which a message is unusable by itself."""
@@ -239,30 +238,25 @@ FEW_RETURNS = 500
 """By hand: largest number of returns of a scan that is too sparse for place recognition."""
 LAG_S = 0.1
 """By hand: least lag that is reported, twice the step of the search."""
-MOUNTING_DEG = 6.0
-"""Least rotation that is reported (*measured* on simulated drives: errors of right mountings reach 3.3 deg, the largest
-about the vertical)."""
 FINE_DEG, FINE_SCALE, FINE_S = 0.5, 0.006, 0.01
 """Least errors by stereo that are reported (*measured* on simulated drives: those of right calibrations reach half)."""
 SURE = 3.0
 """By hand: least standard deviations of an error by stereo that is reported."""
-SAME_DEG = 5.0
-"""By hand: largest difference of two sensors' rotations that is attributed to the odometry."""
 ACROSS = 0.5
 """By hand: least share of the motion along z for which the odometry is not that of the body."""
-_SENSORS = {"lidar": "LiDAR", "camera": "camera"}
 
 
 def about_sensors(seen: SensorReport) -> Iterator[Advice]:
     """Yield findings about exposure, returns, baseline, clocks and mountings."""
     yield from _measurements(seen)
-    if seen.forward is not None and abs(seen.forward[2]) >= max(ACROSS, np.abs(seen.forward[:2]).max()):
+    contradictions = find_contradictions(seen, impossible=False)
+    is_rotated = any(one.subject == "odometry" for one in contradictions)
+    if not is_rotated and seen.forward is not None and abs(seen.forward[2]) >= max(ACROSS, *np.abs(seen.forward[:2])):
         what = "the odometry is not that of the body: it moves along the body's z axis, which is up"
         remedy = "name the frame of the poses: --odometry-frame camera (z forward), imu or lidar"
         yield Advice("fault", what, remedy)
-    known = {name: one for name in _SENSORS if (one := getattr(seen, name)) is not None}
-    by_motion = [*_clocks({name: one.lag_s for name, one in known.items()})]
-    by_motion += _mountings({name: one.mounting_deg for name, one in known.items() if one.mounting_deg is not None})
+    lags = {name: one.lag_s for name in SENSORS if (one := getattr(seen, name)) is not None and one.lag_s is not None}
+    by_motion = [*_clocks(lags), *(Advice("fault", one.what, one.remedy) for one in contradictions)]
     yield from by_motion
     if seen.overlay is not None:
         yield from _overlaid(seen.overlay, bool(by_motion))
@@ -281,7 +275,7 @@ def _overlaid(overlay: Overlay, is_known: bool) -> Iterator[Advice]:
         remedy = f"divide the baseline of the calibration, or P[3] of the right camera_info, by {scale:.3f}"
         yield Advice("fault", what, remedy)
     elif worst == 0 and not is_known:
-        what = f"{seen}, the mounting is wrong: rotating the LiDAR by {_turn(turn)} corrects it"
+        what = f"{seen}, the mounting is wrong: rotating the LiDAR by {describe_turn(turn)} corrects it"
         yield Advice("warning", what, "correct body_T_lidar or body_T_camera of the calibration")
     elif not is_known:
         what = f"{seen}, the LiDAR's clock is about {-overlay.lag_s:+.3f} s off the camera's"
@@ -314,29 +308,8 @@ def _clocks(lags: dict[str, float]) -> Iterator[Advice]:
         yield Advice("fault", what, "correct its stamps: frames take their poses from it")
         return
     for name, lag in off.items():
-        what = f"the {_SENSORS[name]}'s clock is about {-lag:+.1f} s off the odometry's, by its motion"
+        what = f"the {SENSORS[name]}'s clock is about {-lag:+.1f} s off the odometry's, by its motion"
         yield Advice("fault", what, "correct the stamps in its driver (PTP, or a constant): no parameter does")
-
-
-def _mountings(known: dict[str, Array]) -> Iterator[Advice]:
-    off = {name: turn for name, turn in known.items() if np.linalg.norm(turn) > MOUNTING_DEG}
-    if len(off) == 2 and np.linalg.norm(off["lidar"] - off["camera"]) < SAME_DEG:
-        turned = _turn(off["lidar"])
-        what = f"the odometry is not that of the body: by camera and LiDAR it is rotated by {turned}"
-        remedy = "name the frame of the poses (--odometry-frame camera, imu or lidar); a topic must be that of the body"
-        yield Advice("fault", what, remedy)
-        return
-    for name, turn in off.items():
-        what = f"the {_SENSORS[name]}'s mounting is off by {_turn(turn)}, by its motion and the odometry"
-        yield Advice("fault", what, f"correct body_T_{name} of the calibration")
-
-
-def _turn(mounting_deg: Array) -> str:
-    """Return a rotation in words, such as "10 deg, mostly about y"."""
-    axis = int(np.abs(mounting_deg).argmax())
-    digits = 0 if np.linalg.norm(mounting_deg) > SAME_DEG else 1
-    size, along = np.linalg.norm(mounting_deg), mounting_deg[axis]
-    return f"{size:.{digits}f} deg, mostly about {'xyz'[axis]} ({along:+.{digits}f} deg)"
 
 
 _CAUSES = (_truth, _gaps, lambda about: about_sensors(about.sensors), _disparity, _pairs, _inputs)

@@ -24,7 +24,6 @@ from rich.table import Table as Grid
 
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.reader import Bag
-from umf_ros.bags.sensor_check import SensorReport
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Image, LoopClosure
 from umf_ros.core.geometry import Array, evenly
@@ -46,6 +45,7 @@ from umf_ros.runs.scene import (
 )
 from umf_ros.runs.truth import MEDIAN_EXPECTED, Judged, JudgedRun, in_words, judge_run
 from umf_ros.runs.writer import write_summary
+from umf_ros.sensors.sensor_check import SensorReport
 
 
 def render(template: str, **values: Any) -> str:

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from umf_ros.bags.reader import Bag
-from umf_ros.bags.sensor_check import SensorReport
 from umf_ros.core.config import Loop
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, align, heading, invert, relative, transform, wrap_angle
@@ -23,6 +22,7 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.places.database import is_past
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import Endpoints
+from umf_ros.sensors.sensor_check import SensorReport
 from umf_ros.verification.hypothesis import Hypothesis
 
 CONFIDENCE = 0.95

@@ -41,6 +41,7 @@ class RejectReason(Enum):
     TOO_FAR = "farther apart than verification.max_shift_m"
     LESS_PROBABLE = "a more probable closure of this keyframe is published"
     UNCONFIRMED = "pending: no closure of another place agrees yet"
+    SENSORS = "withheld: the sensors contradict each other"
     UNKNOWN = "rejected by another version"
 
 

@@ -10,9 +10,10 @@ import pytest
 from command_line import only_line, umf
 from finished_runs import closure, examined, stamp, trajectory
 
-from umf_ros.bags.sensor_check import Disagreement, SensorReport
 from umf_ros.core.errors import UmfError
 from umf_ros.lab.evaluation.sensors_run import Stretch, describe_sensors, score, stretches_of, table_of
+from umf_ros.sensors.motion_check import Disagreement
+from umf_ros.sensors.sensor_check import SensorReport
 
 EARLY, LATE = Stretch("early", stamp(40), stamp(59.5)), Stretch("late", stamp(59.6), stamp(80))
 

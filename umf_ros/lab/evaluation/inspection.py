@@ -14,7 +14,6 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.presets import detect_dataset, settings_for
 from umf_ros.bags.reader import Bag, decode
-from umf_ros.bags.sensor_check import SensorCheck, SensorReport
 from umf_ros.core.config import Settings, Topics, load_preset, topics_of
 from umf_ros.core.errors import BagError, MessageError, UmfError, either, printable
 from umf_ros.core.frames import Frame
@@ -23,6 +22,7 @@ from umf_ros.core.trajectory import Trajectory, bracket
 from umf_ros.runs.findings import gap_remedy
 from umf_ros.sensors.calibration import TO_BE_MEASURED, load_calibration
 from umf_ros.sensors.decode import OdometrySample, decode_camera_info, decode_cloud, decode_image, decode_odometry
+from umf_ros.sensors.sensor_check import SensorCheck, SensorReport
 from umf_ros.sensors.tf import TOPIC, StaticTransforms
 from umf_ros.sensors.topic_finder import find_topics
 

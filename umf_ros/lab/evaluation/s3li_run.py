@@ -24,7 +24,6 @@ from scipy.stats import binomtest
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.sensor_check import SensorCheck
 from umf_ros.bags.trajectories import read_odometry, read_rtklib
 from umf_ros.core.config import Loop, Settings, load_preset
 from umf_ros.core.errors import UmfError, one_line
@@ -57,6 +56,7 @@ from umf_ros.runs.reader import FinishedRun, read_run, remember_recording
 from umf_ros.runs.truth import JudgedRun, absolute_trajectory_error, find_revisits, judge_run
 from umf_ros.runs.writer import count_drops
 from umf_ros.sensors.calibration import calibration_of
+from umf_ros.sensors.sensor_check import SensorCheck
 
 Record = dict[str, Any]
 """Figures of one sequence, or of several; None for what could not be measured."""
@@ -211,15 +211,15 @@ def write_calibration(one: S3liSequence, folder: Path, notes: list[str]) -> Path
 def _replayed(
     folder: Path, recording: Any, settings: Settings, odometry: Trajectory | None, notes: list[str]
 ) -> tuple[FinishedRun, SensorCheck]:
-    check = SensorCheck()
-    replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)), sensor_check=check)
+    detector = LoopDetector(settings, make_detector_embedder(settings))
+    replay = Replay(folder, settings, detector)
     reader = FrameReader(recording, settings, odometry, warn=notes.append)
     for _ in replay.run(reader.stream()):
         _progress(reader.progress)
     replay.finish(count_drops(reader.counters))
     replay.raise_if_frames_failed()
     remember_recording(folder, recording)
-    return read_run(folder), check
+    return read_run(folder), detector.sensors
 
 
 def judged_record(about: JudgedRun, odometry: Trajectory | None) -> Record:

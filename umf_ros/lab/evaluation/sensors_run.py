@@ -16,7 +16,6 @@ from rich.console import Console
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.sensor_check import SensorCheck, SensorReport
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.errors import UmfError
 from umf_ros.core.tasks import spread
@@ -29,6 +28,7 @@ from umf_ros.runs.report import finish_run, judge
 from umf_ros.runs.run_file import read_odometry_of
 from umf_ros.runs.truth import JudgedRun
 from umf_ros.runs.writer import count_drops
+from umf_ros.sensors.sensor_check import SensorReport
 
 _NOTHING = "/none"
 SENSORS: dict[str, dict[str, Any]] = {
@@ -124,17 +124,17 @@ def replay(task: SensorTask) -> None:
     recording = open_bag(task.bag)
     settings = settings_for(recording, task.config, "auto", **SENSORS[task.name])
     task.folder.mkdir(parents=True)
-    check = SensorCheck() if task.report else None
-    run = Replay(task.folder, settings, LoopDetector(settings, make_detector_embedder(settings)), sensor_check=check)
+    detector = LoopDetector(settings, make_detector_embedder(settings))
+    run = Replay(task.folder, settings, detector)
     reader = FrameReader(recording, settings, None, warn=lambda text: None)
     for _ in run.run(reader.stream()):
         pass
     run.finish(count_drops(reader.counters))
     run.raise_if_frames_failed()
     remember_recording(task.folder, recording)
-    if check is not None:
+    if task.report:
         finished = read_run(task.folder, recording, reader.ground_truth)
-        sensors = check.report(read_odometry_of(task.folder))
+        sensors = detector.sensors.report(read_odometry_of(task.folder))
         finish_run(finished, recording, Console(file=StringIO()), sensors)
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from umf_ros.bags.sensor_check import OVERLAID_FRAMES, Overlay, SensorReport, lay_over, overlay_equations
 from umf_ros.core.frames import Frame, ScanMotion, StereoCamera
 from umf_ros.core.geometry import from_quaternion, make_pose, transform
 from umf_ros.runs.findings import about_sensors
+from umf_ros.sensors.sensor_check import OVERLAID_FRAMES, Overlay, SensorReport, lay_over, overlay_equations
 
 CAMERA = StereoCamera(688, 512, 580.0, 580.0, 343.5, 255.5, 0.2)
 BODY_T_CAMERA = from_quaternion((0.0, 0.1, 1.2), (-0.5, 0.5, -0.5, 0.5))
