@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
 from pathlib import Path
 
@@ -56,7 +56,7 @@ APART = [edge for edge in PLAIN if edge[0] != LAP - 1]
 """Both laps as two rovers."""
 
 
-def _text(values: Sequence[float]) -> str:
+def _text(values: Iterable[float]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
 
 
@@ -64,8 +64,8 @@ def _numbers(pose: Array, scale: float = 1.0) -> list[float]:
     return [*pose[:3, 3], *scale * to_quaternion(pose)]
 
 
-def _upper(diagonal: Sequence[float]) -> Array:
-    return np.diag(diagonal)[np.triu_indices(len(diagonal))]
+def _upper(diagonal: Iterable[float]) -> Array:
+    return np.diag(list(diagonal))[np.triu_indices(len(list(diagonal)))]
 
 
 def vertices(name: Ids = int, scale: float = 1.0, tag: str = "VERTEX_SE3:QUAT") -> list[str]:
@@ -107,6 +107,9 @@ def _symbol(k: int) -> int:
 
 def _alternating(k: int) -> int:
     return 2 * (k % LAP) + k // LAP
+
+
+ROVERS: dict[str, Ids] = {"symbols_two_robots": _symbol, "interleaved_two_robots": _alternating}
 
 
 def _both_ways(measured: Sequence[Measured]) -> list[Measured]:
@@ -191,7 +194,6 @@ def _numbers_dialects() -> dict[str, list[str]]:
         ],
         "no_information": _cut(plain, 10),
         "full_matrix": _full(plain),
-        "nan_edge": [*plain[:-1], f"EDGE_SE3:QUAT 1 41 {_text([np.nan] * 7)} {upper}"],
         "singular_position_only": [*vertices(), *edges(ODOMETRY), *edges(CLOSURES, [*INFORMATION[:3], 0, 0, 0])],
         "infinite_z": [*vertices(), *edges(PLAIN, [*INFORMATION[:2], 1e-9, *INFORMATION[3:]])],
         "infinite": [*vertices(), *edges(ODOMETRY, [np.inf] * 6), *edges(CLOSURES)],
@@ -233,10 +235,11 @@ def _structures() -> dict[str, tuple[list[str], list[Measured]]]:
     found["skip_two_measured"] = [*head, *edges(measured)], measured
     every_second = [*SKIPPING, ODOMETRY[0], *CLOSURES]
     found["skip_one"] = [*head, *edges(every_second)], every_second
-    for name, ids in (("symbols_two_robots", _symbol), ("interleaved_two_robots", _alternating)):
+    for name, ids in ROVERS.items():
         found[name] = [*vertices(ids), *edges(APART, name=ids)], APART
     lap = [edge for edge in ODOMETRY if edge[0] != LAP - 1]
     found["two_components"] = [*head, *edges(lap)], lap
+    found["nan_edge"] = [*head, *edges(PLAIN)[:-1], f"EDGE_SE3:QUAT 1 41 {_text([np.nan] * 28)}"], PLAIN[:-1]
     return found
 
 
@@ -303,14 +306,19 @@ def _case(
     )
 
 
-IDS: dict[str, Ids] = {
-    "symbols_two_robots": _symbol,
-    "interleaved_two_robots": _alternating,
+IDS: dict[str, Ids] = ROVERS | {
     "from_1000": lambda k: 1000 + k,
     "descending": lambda k: COUNT - k,
     "stamps": lambda k: 10**18 + k**2,
 }
-_OWN_EDGES = ("skip_two_measured", "skip_one", "symbols_two_robots", "interleaved_two_robots", "two_components")
+_OWN_EDGES = (
+    "skip_two_measured",
+    "skip_one",
+    "symbols_two_robots",
+    "interleaved_two_robots",
+    "two_components",
+    "nan_edge",
+)
 _LINES = [*vertices(), *edges(PLAIN)]
 CASES = [
     *(

@@ -12,8 +12,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.reader import Bag, RawMessage, decode
 from umf_ros.core.config import Settings
-from umf_ros.core.errors import BagError, MessageError, reading
+from umf_ros.core.errors import BagError, MessageError
 from umf_ros.core.geometry import to_enu
+from umf_ros.core.io import read_lines
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose, stamp_ns
@@ -32,7 +33,7 @@ def read_tum(path: str | Path) -> Trajectory:
     """
     stamps: list[int] = []
     rows: list[list[float]] = []
-    for number, line in enumerate(read_lines(path), 1):
+    for number, line in enumerate(read_lines(path, BagError), 1):
         fields = line.split()
         if not fields or line.lstrip().startswith("#"):
             continue
@@ -110,7 +111,7 @@ def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> Traject
     """
     stamps: list[int] = []
     geodetic: list[tuple[float, float, float]] = []
-    for number, line in enumerate(read_lines(path), 1):
+    for number, line in enumerate(read_lines(path, BagError), 1):
         if line.startswith("%") or not line.strip():
             continue
         try:
@@ -137,13 +138,3 @@ def _parse(fields: list[str]) -> tuple[int, float, float, float, int]:
     else:
         gps_ns = _checked((GPS_EPOCH_S + int(fields[0]) * 604_800) * 10**9 + round(float(fields[1]) * 1e9))
     return gps_ns - LEAP_SECONDS * 10**9, latitude, longitude, height, int(fields[5])
-
-
-def read_lines(path: str | Path) -> list[str]:
-    """Return lines of a text file.
-
-    Raises:
-        BagError: the file cannot be read or is not text.
-    """
-    with reading(path, BagError, "is not a text file"):
-        return Path(path).read_text(encoding="utf-8").splitlines()
