@@ -60,6 +60,12 @@ def _truth(about: JudgedRun) -> Iterator[Advice]:
     run, (known, total) = about.run, about.covered
     if run.truth is None or not total:
         return
+    if about.clock_offset_s:
+        what = (
+            f"the stamps of the ground truth are {about.clock_offset_s:+.1f} s off those of the odometry, by the motion"
+        )
+        yield Advice("fault", what, f"shift them by {-about.clock_offset_s:+.1f} s; nothing was judged")
+        return
     spans = [f"{stamps[0] * 1e-9:.1f} to {stamps[-1] * 1e-9:.1f} s" for stamps in (run.truth.stamps_ns, run.stamps)]
     if not known:
         off_s = (int(run.truth.stamps_ns[0]) - int(run.stamps[0])) * 1e-9

@@ -310,8 +310,8 @@ def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> Judged
         covered, total = judged.covered
         if not covered and total and run.summary["ground_truth"]:
             raise UmfError(
-                f"the ground truth has another clock: it covers none of the {total} keyframes; {run.folder} was "
-                "judged before; nothing was written"
+                f"the ground truth has another clock: it judges none of the {total} keyframes; {run.folder} was judged "
+                "before; nothing was written"
             )
         run.summary["ground_truth"] = judged.summary() if covered or not total else None
     if keep:

@@ -243,7 +243,7 @@ def test_a_run_without_closures_and_trajectories(bag: Path, tmp_path: Path) -> N
         ("keyframes.csv", "stamp_ns,session,travelled_m\n5,0,1.5\n6,0\n", "keyframes.csv, line 3: not a row"),
         ("inliers.csv", "query_stamp_ns,match_stamp_ns,query_u\nx,2,3\n", "inliers.csv, line 2: not a row"),
         ("config.yaml", "loop: {topk: 3}\n", "unknown parameter loop.topk"),
-        ("trajectory_odometry.tum", "1.0 0 0 0\n", "trajectory_odometry.tum, line 1: expected 8 numbers"),
+        ("trajectory_odometry.tum", "1.0 0 0\n", "trajectory_odometry.tum, line 1: expected 8 numbers"),
     ],
 )
 def test_a_damaged_run_is_one_clear_line(run: Path, bag: Path, name: str, content: str | None, message: str) -> None:
@@ -294,5 +294,5 @@ def test_a_truth_of_another_clock_does_not_unjudge_a_run(run: Path, bag: Path, t
     stamps = START_NS - 10**18 + np.arange(40, dtype=np.int64) * 10**8
     write_tum(tmp_path / "other.tum", Trajectory(stamps, np.tile(np.eye(4), (40, 1, 1))))
     line = only_line(umf("report", run, bag, "--ground-truth", tmp_path / "other.tum"))
-    assert line.startswith("the ground truth has another clock: it covers none of the 18 keyframes")
+    assert line.startswith("the ground truth has another clock: it judges none of the 18 keyframes")
     assert ((run / "summary.json").read_bytes(), (run / "report.html").read_bytes()) == before
