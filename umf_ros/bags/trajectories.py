@@ -45,7 +45,7 @@ def read_tum(path: str | Path) -> Trajectory:
     columns, is_named = list[int](), False
     found: list[tuple[int, Decimal, list[float]]] = []
     for number, line in enumerate(read_lines(path, BagError), 1):
-        if names := _named_columns(line):
+        if names := _named_columns(line) if "q" in line.lower() else None:
             columns, is_named = names, True
         if not line.strip() or names or line.lstrip()[0] in "#%":
             continue
@@ -68,7 +68,7 @@ def read_tum(path: str | Path) -> Trajectory:
 
 
 def _named_columns(line: str) -> list[int] | None:
-    """Return the columns of stamp, x, y, z, qx, qy, qz, qw in a line of names such as EuRoC's; None of other lines."""
+    """Return the columns of stamp, x, y, z, qx, qy, qz, qw in a line of their names; None of other lines."""
     names = [re.sub("[^a-z]", "", name) for name in _split(re.sub(r"\[.*?\]|^\s*[#%]", "", line.lower()))]
     times = [k for k, name in enumerate(names) if name == "t" or name.startswith(("time", "stamp", "sec"))]
     places = [[k for k, name in enumerate(names) if name[:1] != "q" and name.endswith(axis)] for axis in "xyz"]

@@ -210,7 +210,7 @@ def _stated_errors(about: JudgedRun) -> Iterator[Advice]:
     median, inside = truth.get("nees_median"), truth.get("inside_95")
     words = "" if median is None or inside is None else in_words(median, inside)
     if words.startswith("too small"):
-        remedy = "the calibration's mounting or the odometry within a scan"
+        remedy = "the calibration's mounting, the odometry within a scan, or the clock of the ground truth"
         yield Advice("warning", f"stated errors of the closures are {words}", remedy)
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from umf_ros.bags.reader import Bag
-from umf_ros.bags.sensor_check import SensorReport
+from umf_ros.bags.sensor_check import BETTER, CONTRAST, SensorReport
 from umf_ros.core.config import Loop
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, align, heading, interpolate, invert, relative, transform, wrap_angle
@@ -71,8 +71,8 @@ POSE_TOLERANCE_DEG = 5.0
 TRUTH_SHARE = 0.5
 """By hand: largest error of an interpolated true pose, of the tolerances."""
 CHORDS_S, MOST_CHORDS, LAGS_S = (2.0, 5.0, 12.0), 300, np.arange(-600, 601) / 10
-LEAST_OFFSET_S, CLEARLY = 0.3, 0.5
-"""By hand: least offset of a clock that is reported, and largest residual of it by the residual without it."""
+LEAST_OFFSET_S, COVERED = 0.3, 0.25
+"""By hand: least offset of a clock that is reported, and least share of the odometry that the truth covers then."""
 
 Stamps = NDArray[np.int64]
 
@@ -208,9 +208,8 @@ def true_poses(truth: Trajectory, stamps: Stamps) -> tuple[Array, NDArray[np.boo
     right closure look false is unknown.
     """
     poses, known = truth.at(stamps)
-    errors = np.zeros((len(stamps), 2))
-    if len(truth) < 3 or not len(stamps):
-        return poses, known, errors
+    if len(truth) < 3:
+        return poses, known, np.zeros((len(stamps), 2))
     past, future = np.diff(truth.stamps_ns[:-1]) * 1e-9, np.diff(truth.stamps_ns[1:]) * 1e-9
     guesses = interpolate(truth.poses[:-2], truth.poses[2:], past / (past + future))
     bends = np.pad(_sizes(relative(guesses, truth.poses[1:-1])) / (past * future), ((0, 0), (1, 1)), mode="edge")
@@ -233,17 +232,15 @@ def clock_offset(odometry: Trajectory | None, truth: Trajectory) -> float:
     """
     if odometry is None or not len(odometry) or not len(truth):
         return 0.0
-    start_ns = int(odometry.stamps_ns[0])
-    first, last = 0.0, (int(odometry.stamps_ns[-1]) - start_ns) * 1e-9
-    starts = np.linspace(first, max(last - max(CHORDS_S), 0), MOST_CHORDS)
-    driven = _chords(odometry, starts, start_ns)
-    differences = np.abs(_chords(truth, starts + LAGS_S[:, None], start_ns) - driven)
+    start_ns, end_ns = odometry.stamps_ns[[0, -1]].tolist()
+    starts = np.linspace(0, max((end_ns - start_ns) * 1e-9 - max(CHORDS_S), 0), MOST_CHORDS)
+    differences = np.abs(_chords(truth, starts + LAGS_S[:, None], start_ns) - _chords(odometry, starts, start_ns))
     covered = np.isfinite(differences).all(axis=-1)
     costs = np.where(covered, differences.mean(axis=-1), 0).sum(axis=1) / np.maximum(covered.sum(axis=1), 1)
-    costs[covered.mean(axis=1) < 0.5] = inf
+    costs[covered.mean(axis=1) < COVERED] = inf
     best, unmoved = int(np.argmin(costs)), costs[len(costs) // 2]
-    clear = isfinite(unmoved) and costs[best] < CLEARLY * min(unmoved, np.median(costs[np.isfinite(costs)]))
-    return float(LAGS_S[best]) if clear and abs(LAGS_S[best]) >= LEAST_OFFSET_S else 0.0
+    limit = min(BETTER * unmoved, CONTRAST * np.median(costs[np.isfinite(costs)])) if isfinite(unmoved) else 0.0
+    return float(LAGS_S[best]) if costs[best] < limit and abs(LAGS_S[best]) >= LEAST_OFFSET_S else 0.0
 
 
 def _chords(path: Trajectory, starts_s: Array, origin_ns: int) -> Array:
