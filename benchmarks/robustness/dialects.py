@@ -18,10 +18,11 @@ from typing import Annotated
 import typer
 from dialect_case import Case
 from dialects_graphs import CASES as GRAPHS
+from dialects_trajectories import CASES as TRAJECTORIES
 from rich.console import Console
 from rich.markup import escape
 
-CASES: list[Case] = [*GRAPHS]
+CASES: list[Case] = [*GRAPHS, *TRAJECTORIES]
 
 
 def main(

@@ -56,15 +56,14 @@ def _inputs(about: JudgedRun) -> Iterator[Advice]:
         yield Advice("warning", text)
 
 
-def _truth(about: JudgedRun) -> Iterator[Advice]:
+def about_truth(about: JudgedRun) -> Iterator[Advice]:
+    """Yield findings about the clock of the ground truth and its coverage."""
     run, (known, total) = about.run, about.covered
     if run.truth is None or not total:
         return
     if about.clock_offset_s:
-        what = (
-            f"the stamps of the ground truth are {about.clock_offset_s:+.1f} s off those of the odometry, by the motion"
-        )
-        yield Advice("fault", what, f"shift them by {-about.clock_offset_s:+.1f} s; nothing was judged")
+        what = f"the ground truth's clock is {about.clock_offset_s:+.1f} s off that of the odometry, by the motion"
+        yield Advice("fault", what, f"shift its stamps by {-about.clock_offset_s:+.1f} s; nothing was judged")
         return
     spans = [f"{stamps[0] * 1e-9:.1f} to {stamps[-1] * 1e-9:.1f} s" for stamps in (run.truth.stamps_ns, run.stamps)]
     if not known:
@@ -345,7 +344,7 @@ def _turn(mounting_deg: Array) -> str:
     return f"{size:.{digits}f} deg, mostly about {'xyz'[axis]} ({along:+.{digits}f} deg)"
 
 
-_CAUSES = (_truth, _gaps, lambda about: about_sensors(about.sensors), _disparity, _pairs, _inputs)
+_CAUSES = (about_truth, _gaps, lambda about: about_sensors(about.sensors), _disparity, _pairs, _inputs)
 _EFFECTS = (_graph, _absolute, _closures, _unjudged, _map, _stated_errors, _speed, _end)
 
 

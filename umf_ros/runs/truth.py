@@ -235,12 +235,15 @@ def clock_offset(odometry: Trajectory | None, truth: Trajectory) -> float:
     start_ns, end_ns = odometry.stamps_ns[[0, -1]].tolist()
     starts = np.linspace(0, max((end_ns - start_ns) * 1e-9 - max(CHORDS_S), 0), MOST_CHORDS)
     differences = np.abs(_chords(truth, starts + LAGS_S[:, None], start_ns) - _chords(odometry, starts, start_ns))
-    covered = np.isfinite(differences).all(axis=-1)
-    costs = np.where(covered, differences.mean(axis=-1), 0).sum(axis=1) / np.maximum(covered.sum(axis=1), 1)
-    costs[covered.mean(axis=1) < COVERED] = inf
-    best, unmoved = int(np.argmin(costs)), costs[len(costs) // 2]
-    limit = min(BETTER * unmoved, CONTRAST * np.median(costs[np.isfinite(costs)])) if isfinite(unmoved) else 0.0
-    return float(LAGS_S[best]) if costs[best] < limit and abs(LAGS_S[best]) >= LEAST_OFFSET_S else 0.0
+    covered = np.isfinite(differences.sum(axis=-1))
+    sums = np.where(covered, differences.mean(axis=-1), 0).sum(axis=1)
+    costs = np.where(covered.mean(axis=1) < COVERED, inf, sums / np.maximum(covered.sum(axis=1), 1))
+    # laps repeat the distances: of equal offsets the smallest
+    best, unmoved = int(np.argmin(costs * (1 + 0.01 * np.abs(LAGS_S)))), len(costs) // 2
+    both = covered[best] & covered[unmoved]
+    usual = np.median(costs[np.isfinite(costs)]) if both.mean() >= COVERED else 0.0
+    clear = differences[best, both].sum() < BETTER * differences[unmoved, both].sum() and costs[best] < CONTRAST * usual
+    return float(LAGS_S[best]) if clear and abs(LAGS_S[best]) >= LEAST_OFFSET_S else 0.0
 
 
 def _chords(path: Trajectory, starts_s: Array, origin_ns: int) -> Array:

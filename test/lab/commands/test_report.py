@@ -294,5 +294,5 @@ def test_a_truth_of_another_clock_does_not_unjudge_a_run(run: Path, bag: Path, t
     stamps = START_NS - 10**18 + np.arange(40, dtype=np.int64) * 10**8
     write_tum(tmp_path / "other.tum", Trajectory(stamps, np.tile(np.eye(4), (40, 1, 1))))
     line = only_line(umf("report", run, bag, "--ground-truth", tmp_path / "other.tum"))
-    assert line.startswith("the ground truth has another clock: it judges none of the 18 keyframes")
+    assert line.startswith("the ground truth has another clock: it covers none of the 18 keyframes")
     assert ((run / "summary.json").read_bytes(), (run / "report.html").read_bytes()) == before
