@@ -160,7 +160,8 @@ def test_a_truth_of_another_clock_judges_nothing_and_its_offset_is_found(shift_s
     drift = np.diag([1.02, 1.02, 1, 1]) @ wound(2).poses
     odometry = Trajectory(wound(2).stamps_ns, np.concatenate([wound(2).poses[:, :, :3], drift[:, :, 3:]], axis=2))
     found = judged(wound(20, shift_s, has_orientation), LOOPS, odometry=odometry)
-    assert found.clock_offset_s == pytest.approx(shift_s, abs=0.11)
+    # laps of 40 s repeat themselves
+    assert found.clock_offset_s != 0 and abs((found.clock_offset_s - shift_s + 20) % 40 - 20) < 0.11
     assert found.closures.size == 0 and found.covered == (0, len(ROWS)) and found.missed == []
     assert found.ate_odometry_m is None and found.same_places(39).size == 0
     right = judged(wound(20, 0.0, has_orientation), LOOPS, odometry=odometry)

@@ -112,11 +112,10 @@ def _is_w_first(positions: Array, quaternions: Array) -> bool:
     moved = np.diff(positions[rows], axis=0)
     far = np.linalg.norm(moved, axis=1) > 0.2 * np.mean(np.linalg.norm(moved, axis=1))
     directions = moved[far] / np.linalg.norm(moved[far], axis=1, keepdims=True)
-    shares = []
-    for turns in (quaternions, np.roll(quaternions, -1, axis=1)):
-        seen = Rotation.from_quat(turns[rows[:-1][far]]).inv().apply(directions)
-        shares.append(np.linalg.eigvalsh(seen.T @ seen / max(len(seen), 1))[-1])
-    return len(directions) > FEW_POSES and bool(shares[1] > max(ALONG, shares[0] + CLEARLY))
+    orders = (np.roll(quaternions, -first, axis=1)[rows[:-1][far]] for first in (0, 1))
+    seen = [Rotation.from_quat(turns).inv().apply(directions) for turns in orders]
+    last, first = (np.linalg.eigvalsh(one.T @ one / max(len(one), 1))[-1] for one in seen)
+    return len(directions) > FEW_POSES and bool(first > max(ALONG, last + CLEARLY))
 
 
 def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajectory:

@@ -70,7 +70,7 @@ POSE_TOLERANCE_M = 0.5
 POSE_TOLERANCE_DEG = 5.0
 TRUTH_SHARE = 0.5
 """By hand: largest error of an interpolated true pose, of the tolerances."""
-CHORDS_S, MOST_CHORDS, LAGS_S = (2.0, 5.0, 12.0), 300, np.arange(-600, 601) / 10
+CHORDS_S, LAGS_S = np.tile([2.0, 16.0], 150), np.arange(-600, 601) / 10
 LEAST_OFFSET_S, COVERED = 0.3, 0.25
 """By hand: least offset of a clock that is reported, and least share of the odometry that the truth covers then."""
 
@@ -233,28 +233,26 @@ def clock_offset(odometry: Trajectory | None, truth: Trajectory) -> float:
     if odometry is None or not len(odometry) or not len(truth):
         return 0.0
     start_ns, end_ns = odometry.stamps_ns[[0, -1]].tolist()
-    starts = np.linspace(0, max((end_ns - start_ns) * 1e-9 - max(CHORDS_S), 0), MOST_CHORDS)
-    differences = np.abs(_chords(truth, starts + LAGS_S[:, None], start_ns) - _chords(odometry, starts, start_ns))
-    covered = np.isfinite(differences.sum(axis=-1))
-    sums = np.where(covered, differences.mean(axis=-1), 0).sum(axis=1)
-    costs = np.where(covered.mean(axis=1) < COVERED, inf, sums / np.maximum(covered.sum(axis=1), 1))
+    starts = np.linspace(0, max((end_ns - start_ns) * 1e-9 - max(CHORDS_S), 0), len(CHORDS_S))
+    driven = _chords(odometry, starts, start_ns)
+    differences = np.ma.masked_invalid(np.abs(_chords(truth, starts + LAGS_S[:, None], start_ns) - driven))
+    costs = np.ma.masked_where(differences.count(axis=1) < COVERED * len(CHORDS_S), differences.mean(axis=1))
     # laps repeat the distances: of equal offsets the smallest
-    best, unmoved = int(np.argmin(costs * (1 + 0.01 * np.abs(LAGS_S)))), len(costs) // 2
-    both = covered[best] & covered[unmoved]
-    usual = np.median(costs[np.isfinite(costs)]) if both.mean() >= COVERED else 0.0
-    clear = differences[best, both].sum() < BETTER * differences[unmoved, both].sum() and costs[best] < CONTRAST * usual
+    best = int(np.ma.argmin(costs * (1 + 0.01 * np.abs(LAGS_S))))
+    both = differences[[best, len(LAGS_S) // 2]]
+    moved, unmoved = np.ma.compress_cols(both).sum(axis=1)
+    clear = moved < BETTER * unmoved and costs[best] < CONTRAST * np.ma.median(costs)
     return float(LAGS_S[best]) if clear and abs(LAGS_S[best]) >= LEAST_OFFSET_S else 0.0
 
 
 def _chords(path: Trajectory, starts_s: Array, origin_ns: int) -> Array:
-    """Return (..., N) distances from the positions at starts (...) to those N times later, NaN outside."""
-    seconds = (path.stamps_ns - origin_ns) * 1e-9
-
-    def at(times: Array) -> Array:
-        return np.stack([np.interp(times, seconds, axis, nan, nan) for axis in path.poses[:, :3, 3].T], axis=-1)
-
-    begin = at(starts_s)
-    return np.stack([np.linalg.norm(at(starts_s + span) - begin, axis=-1) for span in CHORDS_S], axis=-1)
+    """Return (...) distances from the positions at starts (...) to those `CHORDS_S` later, NaN outside."""
+    seconds, positions = (path.stamps_ns - origin_ns) * 1e-9, path.poses[:, :3, 3].T
+    begin, end = (
+        np.stack([np.interp(starts_s + later, seconds, axis, nan, nan) for axis in positions])
+        for later in (0, CHORDS_S)
+    )
+    return np.linalg.norm(end - begin, axis=0)
 
 
 def judge_run(run: FinishedRun, bag: Bag | None = None) -> JudgedRun:
