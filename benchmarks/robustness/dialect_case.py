@@ -14,7 +14,7 @@ LIMIT_S = 1200.0
 
 
 class Outcome(NamedTuple):
-    """What a command left: its exit status, its console output without empty lines, and its folder."""
+    """Result of a command: its exit status, its console output without empty lines, and its folder."""
 
     status: int
     said: str

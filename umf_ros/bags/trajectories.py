@@ -142,9 +142,7 @@ def read_ground_truth(bag: Bag | None, path: str | Path | None = None) -> Trajec
         BagError: the file cannot be read or has a wrong line.
     """
     if path is not None:
-        if Path(path).suffix.lower() != ".pos":
-            return read_tum(path)
-        return read_rtklib(path)
+        return read_rtklib(path) if Path(path).suffix.lower() == ".pos" else read_tum(path)
     if bag is None or GROUND_TRUTH_TOPIC not in bag.topics:
         return None
     return decode_ground_truth(bag, bag.raw_messages([GROUND_TRUTH_TOPIC]))

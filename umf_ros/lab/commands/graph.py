@@ -31,7 +31,11 @@ def optimize(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File for the optimised graph (g2o).")] = None,
     verdicts: Annotated[Path | None, typer.Option(help="File for the verdicts on all closures (CSV).")] = None,
 ) -> None:
-    """Pass a graph file through the back-end as if it came live, and print the rejected closures."""
+    """Pass a graph file through the back-end as if it came live, and print the rejected closures.
+
+    Edges between successive vertices are odometry, and so are many over the next few; repeated ones count once.
+    Units of the information that contradict the residuals by orders are found and said.
+    """
     if reject not in ("all", "none"):
         raise ConfigError(f"--reject {reject}: expected all or none")
 
