@@ -10,8 +10,9 @@ import numpy as np
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, expmap, invert, make_pose, relative
-from umf_ros.lab.datasets.g2o import Edge, G2oGraph, GraphRecording
-from umf_ros.lab.datasets.g2o import drive as drive_recording
+from umf_ros.lab.datasets.g2o import Edge, G2oGraph
+from umf_ros.lab.datasets.graph_recording import GraphRecording
+from umf_ros.lab.datasets.graph_recording import drive as drive_recording
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, WorldClosure
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import Closures, PlacedClosure, State, as_closures

@@ -33,7 +33,8 @@ from numpy.typing import NDArray
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, adjoint, invert, logmap, propagate
-from umf_ros.lab.datasets.g2o import PERIOD_NS, as_recording, read_g2o
+from umf_ros.lab.datasets.g2o import read_g2o
+from umf_ros.lab.datasets.graph_recording import PERIOD_NS, as_recording
 from umf_ros.lab.simulation.pose_graphs import (
     WORLDS,
     GraphWorld,

@@ -18,7 +18,8 @@ from umf_ros.core.config import Database, load_settings
 from umf_ros.core.frames import Embedding, Keyframe, StereoCamera
 from umf_ros.core.resources import find
 from umf_ros.durable_graph import DurableGraph
-from umf_ros.lab.datasets.g2o import as_recording, read_g2o
+from umf_ros.lab.datasets.g2o import read_g2o
+from umf_ros.lab.datasets.graph_recording import as_recording
 from umf_ros.lab.datasets.s3li import load_data_frame, load_pickle
 from umf_ros.lab.scan_files import read_scan
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops

@@ -23,14 +23,12 @@ from graph_worlds import (
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import make_pose
-from umf_ros.lab.datasets.g2o import (
+from umf_ros.lab.datasets.g2o import Edge, read_g2o, write_plane
+from umf_ros.lab.datasets.graph_recording import (
     PERIOD_NS,
-    Edge,
     as_recording,
     drive,
-    read_g2o,
     write_optimised,
-    write_plane,
     write_verdicts_by_vertex,
 )
 from umf_ros.pose_graph.backend import PoseGraph

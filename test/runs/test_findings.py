@@ -116,6 +116,13 @@ def test_a_truth_of_another_clock_is_named_and_judges_nothing(tmp_path: Path) ->
     assert "+10000.0 s from start to start" in sentence and "true and" not in sentence
 
 
+def test_an_offset_of_the_truths_clock_is_named_and_judges_nothing(tmp_path: Path) -> None:
+    about = replace(examined(tmp_path, [closure(50, 10)], verdict=accepted(), truth=trajectory()), clock_offset_s=-2.0)
+    mark, _, sentence = verdict(replace(about, covered=(0, 40)))
+    assert mark == "bad" and sentence.startswith("The ground truth's clock is -2.0 s off that of the odometry")
+    assert "true and" not in sentence and "+2.0 s; nothing was judged" in look_first(about)[0].remedy
+
+
 def test_closures_that_the_graph_did_not_use_are_pending_not_rejected(tmp_path: Path) -> None:
     waiting = accepted(State.PENDING, ClosureReason.NO_ODOMETRY_YET)
     mark, _, sentence = verdict(examined(tmp_path, [closure(50, 10)], verdict=waiting, truth=trajectory()))

@@ -130,6 +130,62 @@ def test_a_truth_without_headings_judges_distances() -> None:
     assert all(math.isnan(one.rotation_error_deg) for one in found.closures)
 
 
+def winding(second: float) -> Array:
+    """Laps of 40 s of an eight, faster in one half of it, with a slow one at the end."""
+    phase = 2 * np.pi * (second / 40 + 0.04 * np.sin(2 * np.pi * second / 40))
+    yaw = np.arctan2(2 * np.cos(2 * phase), np.cos(phase))
+    turn = Rotation.from_euler("zyx", [yaw, 0.05 * np.sin(phase), 0.0])
+    return make_pose(turn.as_matrix(), [10 * np.sin(phase), 10 * np.sin(2 * phase), 0.0])
+
+
+def wound(rate_hz: float, shift_s: float = 0.0, has_orientation: bool = True) -> Trajectory:
+    seconds = np.arange(0, 100, 1 / rate_hz)
+    poses = np.stack(
+        [winding(second) if has_orientation else make_pose(np.eye(3), winding(second)[:3, 3]) for second in seconds]
+    )
+    return Trajectory(np.array([stamp(second + shift_s) for second in seconds], np.int64), poses, has_orientation)
+
+
+LOOPS = [
+    LoopClosure(
+        stamp(40 + past + 0.1), stamp(past), relative(winding(past), winding(40 + past + 0.1)), 1e-4 * np.eye(6)
+    )
+    for past in np.arange(3.3, 50, 2.2)
+]
+
+
+@pytest.mark.parametrize("has_orientation", [True, False])
+@pytest.mark.parametrize("shift_s", [-18.0, -2.0, -0.5, 0.5, 2.0, 7.3])
+def test_a_truth_of_another_clock_judges_nothing_and_its_offset_is_found(shift_s: float, has_orientation: bool) -> None:
+    drift = np.diag([1.02, 1.02, 1, 1]) @ wound(2).poses
+    odometry = Trajectory(wound(2).stamps_ns, np.concatenate([wound(2).poses[:, :, :3], drift[:, :, 3:]], axis=2))
+    found = judged(wound(20, shift_s, has_orientation), LOOPS, odometry=odometry)
+    # laps of 40 s repeat themselves
+    assert found.clock_offset_s != 0 and abs((found.clock_offset_s - shift_s + 20) % 40 - 20) < 0.11
+    assert found.closures.size == 0 and found.covered == (0, len(ROWS)) and found.missed == []
+    assert found.ate_odometry_m is None and found.same_places(39).size == 0
+    right = judged(wound(20, 0.0, has_orientation), LOOPS, odometry=odometry)
+    assert right.clock_offset_s == 0 and right.closures.is_true.all() and len(right.closures) == len(LOOPS)
+
+
+@pytest.mark.parametrize("has_orientation", [True, False])
+@pytest.mark.parametrize("rate_hz", [20.0, 5.0, 1.0, 0.7, 0.5])
+def test_no_right_closure_is_false_because_the_truth_is_sparse(rate_hz: float, has_orientation: bool) -> None:
+    found = judged(wound(rate_hz, has_orientation=has_orientation), LOOPS)
+    assert found.closures.is_true.all()
+    assert len(found.closures) == len(LOOPS) or rate_hz <= 1
+    if has_orientation and len(found.closures):
+        assert rate_hz < 1 or len(found.closures) > len(LOOPS) / 2
+        # exact closures: a truth that is off by centimetres must not make their covariances look small
+        assert np.median(found.closures.nees) < 6
+
+
+def test_wrong_closures_are_false_by_a_sparse_truth_too() -> None:
+    wrong = [replace(one, match_T_query=one.match_T_query @ make_pose(np.eye(3), [0, 1.5, 0])) for one in LOOPS]
+    found = judged(wound(1), wrong)
+    assert len(found.closures) > len(LOOPS) / 2 and not found.closures.is_true.any()
+
+
 def test_the_summary_compares_stated_errors_with_true_ones() -> None:
     # a standard deviation of a metre stated everywhere: the normalised error is the error in metres
     found = judged(truth(), [closure(42, 2, 0.1), closure(44, 5, 2.0), closure(46, 6, 4.0)])

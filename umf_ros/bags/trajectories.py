@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import re
 from collections.abc import Iterable
 from decimal import Decimal
 from pathlib import Path
@@ -12,12 +14,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.reader import Bag, RawMessage, decode
 from umf_ros.core.config import Settings
-from umf_ros.core.errors import BagError, MessageError, reading
-from umf_ros.core.geometry import to_enu
+from umf_ros.core.errors import BagError, MessageError
+from umf_ros.core.geometry import Array, to_enu
+from umf_ros.core.io import read_lines
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose, stamp_ns
 
+logger = logging.getLogger(__name__)
+KITTI, FEW_POSES, PIECES = 12, 9, 100
+"""Numbers in a line of KITTI's poses; poses whose rotation may be equal by chance; pieces of a path, by hand."""
+ALONG, CLEARLY = 0.8, 0.2
+"""Share of the motion along one axis of a rover's body, and by how much a right order of w is better: by hand."""
 GPS_EPOCH_S, LEAP_SECONDS = 315_964_800, 18
 """1980-01-06 in POSIX seconds; GPS time is ahead of UTC by this much since 2017."""
 WORST_QUALITY = 2
@@ -25,34 +33,89 @@ WORST_QUALITY = 2
 
 
 def read_tum(path: str | Path) -> Trajectory:
-    """Return the trajectory from a TUM file: `seconds x y z qx qy qz qw` per line, # for comments.
+    """Return the trajectory from a text file: `stamp x y z qx qy qz qw` per line, or `stamp x y z` without rotations.
+
+    Stamps are seconds, milli-, micro- or nanoseconds. Numbers are separated by blanks, commas or semicolons; a line of
+    names before them gives their order, else further columns are left out. # and % begin comments. Lines with NaN are
+    left out. Rotations that never change while the positions do are unknown.
 
     Raises:
         BagError: the file cannot be read; names the wrong line.
     """
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in enumerate(read_lines(path), 1):
-        fields = line.split()
-        if not fields or line.lstrip().startswith("#"):
+    columns, is_named = list[int](), False
+    found: list[tuple[int, Decimal, list[float]]] = []
+    for number, line in enumerate(read_lines(path, BagError), 1):
+        if names := _named_columns(line) if "q" in line.lower() else None:
+            columns, is_named = names, True
+        if not line.strip() or names or line.lstrip()[0] in "#%":
             continue
+        fields = _split(line)
+        columns = columns or list(range(4 if len(fields) == 4 else 8))
+        if len(fields) <= max(columns) or (len(fields) == KITTI and not is_named):
+            expected = "8 numbers (stamp x y z qx qy qz qw; KITTI's poses have no stamps)"
+            raise BagError(f"{path}, line {number}: expected {expected}, found {len(fields)}")
         try:
-            stamp, row = _checked(int(Decimal(fields[0]) * 10**9)), [float(field) for field in fields[1:]]
+            stamp, row = Decimal(fields[columns[0]]), [float(fields[column]) for column in columns[1:]]
+            found.append((number, stamp if stamp.is_finite() else Decimal(""), row))
         except (ValueError, ArithmeticError):
             raise BagError(f"{path}, line {number}: expected numbers, found {line.strip()[:60]!r}") from None
-        if len(row) != 7:
-            raise BagError(f"{path}, line {number}: expected 8 numbers (stamp x y z qx qy qz qw), found {len(fields)}")
-        if not np.isfinite(row).all() or abs(np.linalg.norm(row[3:]) - 1) > 0.01:
-            raise BagError(f"{path}, line {number}: not a pose (a number is not finite, or no unit quaternion)")
-        if stamps and stamp <= stamps[-1]:
-            raise BagError(f"{path}, line {number}: the stamp {fields[0]} is not later than the one before")
-        stamps.append(stamp)
-        rows.append(row)
-    if not stamps:
+    known = [one for one in found if np.isfinite(one[2]).all()]
+    if not known:
         raise BagError(f"{path} holds no pose")
-    values = np.array(rows)
-    poses = RigidTransform.from_components(values[:, :3], Rotation.from_quat(values[:, 3:])).as_matrix()
+    if len(known) < len(found):
+        logger.warning("%s: %d lines without a pose (NaN) are left out", path, len(found) - len(known))
+    return _as_trajectory(path, known, is_named)
+
+
+def _named_columns(line: str) -> list[int] | None:
+    """Return the columns of stamp, x, y, z, qx, qy, qz, qw in a line of their names; None of other lines."""
+    names = [re.sub("[^a-z]", "", name) for name in _split(re.sub(r"\[.*?\]|^\s*[#%]", "", line.lower()))]
+    times = [k for k, name in enumerate(names) if name == "t" or name.startswith(("time", "stamp", "sec"))]
+    places = [[k for k, name in enumerate(names) if name[:1] != "q" and name.endswith(axis)] for axis in "xyz"]
+    turns = [[k for k, name in enumerate(names) if name[:1] == "q" and name.endswith(axis)] for axis in "xyzw"]
+    chosen = [times, *places, *turns]
+    return [one[0] for one in chosen] if all(chosen) else None
+
+
+def _split(line: str) -> list[str]:
+    if re.search(r"\d,\d", line) and (";" in line or len(line.split()) > 3):
+        line = line.replace(",", ".")  # decimal commas
+    return re.split(r"\s*[,;]\s*|\s+", line.strip(" \t,;"))
+
+
+def _as_trajectory(path: str | Path, found: list[tuple[int, Decimal, list[float]]], is_named: bool) -> Trajectory:
+    """Return the poses of lines (number, stamp, x y z qx qy qz qw); w may be first unless the order `is_named`."""
+    size = float(np.median([abs(float(stamp)) for _, stamp, _ in found]))
+    unit = next(unit for unit, limit in ((10**9, 1e11), (10**6, 1e14), (1000, 1e17), (1, np.inf)) if size < limit)
+    kept = [one for k, one in enumerate(found) if one[1:] != found[k - 1][1:] or not k]  # written twice
+    stamps, values = [int(stamp * unit) for _, stamp, _ in kept], np.array([row for *_, row in kept])
+    for (number, stamp, _), before, now in zip(kept, [-LAST_STAMP_NS, *stamps], stamps, strict=False):
+        if not before < now < LAST_STAMP_NS:
+            raise BagError(f"{path}, line {number}: the stamp {stamp} is not later than the one before, or beyond all")
+    positions, turns = values[:, :3], values[:, 3:]
+    if not turns.any() or (len(turns) > FEW_POSES and not np.ptp(turns, axis=0).any()):
+        poses = RigidTransform.from_translation(positions).as_matrix()
+        return Trajectory(np.array(stamps, np.int64), poses, has_orientation=False)
+    wrong = np.flatnonzero(np.abs(np.linalg.norm(turns, axis=1) - 1) > 0.01)
+    if len(wrong):
+        raise BagError(f"{path}, line {kept[wrong[0]][0]}: not a pose (no unit quaternion)")
+    if not is_named and _is_w_first(positions, turns):
+        logger.warning("%s: quaternions are read with w first, as the motion shows; a header qx qy qz qw decides", path)
+        turns = np.roll(turns, -1, axis=1)
+    poses = RigidTransform.from_components(positions, Rotation.from_quat(turns)).as_matrix()
     return Trajectory(np.array(stamps, np.int64), poses)
+
+
+def _is_w_first(positions: Array, quaternions: Array) -> bool:
+    """Return whether the body moves along one axis of its own if w is first in quaternions (N, 4), and not if last."""
+    rows = np.unique(np.linspace(0, len(positions) - 1, PIECES + 1).astype(int))
+    moved = np.diff(positions[rows], axis=0)
+    far = np.linalg.norm(moved, axis=1) > 0.2 * np.mean(np.linalg.norm(moved, axis=1))
+    directions = moved[far] / np.linalg.norm(moved[far], axis=1, keepdims=True)
+    orders = (np.roll(quaternions, -first, axis=1)[rows[:-1][far]] for first in (0, 1))
+    seen = [Rotation.from_quat(turns).inv().apply(directions) for turns in orders]
+    last, first = (np.linalg.eigvalsh(one.T @ one / max(len(one), 1))[-1] for one in seen)
+    return len(directions) > FEW_POSES and bool(first > max(ALONG, last + CLEARLY))
 
 
 def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajectory:
@@ -66,7 +129,10 @@ def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajector
     mountings = {"body": np.eye(4), **mountings}
     if frame not in mountings:
         raise BagError(f"unknown frame {frame!r} of the odometry; expected one of {', '.join(mountings)}")
-    return read_tum(path).of_body(mountings[frame])
+    found = read_tum(path)
+    if not found.has_orientation and len(found) > 1:
+        raise BagError(f"{path} has no rotations (none, or the same in every line): odometry needs them")
+    return found.of_body(mountings[frame])
 
 
 def read_ground_truth(bag: Bag | None, path: str | Path | None = None) -> Trajectory | None:
@@ -76,9 +142,7 @@ def read_ground_truth(bag: Bag | None, path: str | Path | None = None) -> Trajec
         BagError: the file cannot be read or has a wrong line.
     """
     if path is not None:
-        if Path(path).suffix.lower() != ".pos":
-            return read_tum(path)
-        return read_rtklib(path)
+        return read_rtklib(path) if Path(path).suffix.lower() == ".pos" else read_tum(path)
     if bag is None or GROUND_TRUTH_TOPIC not in bag.topics:
         return None
     return decode_ground_truth(bag, bag.raw_messages([GROUND_TRUTH_TOPIC]))
@@ -110,7 +174,7 @@ def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> Traject
     """
     stamps: list[int] = []
     geodetic: list[tuple[float, float, float]] = []
-    for number, line in enumerate(read_lines(path), 1):
+    for number, line in enumerate(read_lines(path, BagError), 1):
         if line.startswith("%") or not line.strip():
             continue
         try:
@@ -137,13 +201,3 @@ def _parse(fields: list[str]) -> tuple[int, float, float, float, int]:
     else:
         gps_ns = _checked((GPS_EPOCH_S + int(fields[0]) * 604_800) * 10**9 + round(float(fields[1]) * 1e9))
     return gps_ns - LEAP_SECONDS * 10**9, latitude, longitude, height, int(fields[5])
-
-
-def read_lines(path: str | Path) -> list[str]:
-    """Return lines of a text file.
-
-    Raises:
-        BagError: the file cannot be read or is not text.
-    """
-    with reading(path, BagError, "is not a text file"):
-        return Path(path).read_text(encoding="utf-8").splitlines()

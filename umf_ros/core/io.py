@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import fcntl
 import logging
@@ -48,6 +49,18 @@ def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
+
+
+def read_lines(path: str | Path, kind: type[UmfError]) -> list[str]:
+    """Return lines of a text file in UTF-8, or in UTF-16 with a byte-order mark.
+
+    Raises:
+        kind: the file cannot be read or is not text.
+    """
+    with reading(path, kind, "is not a text file"):
+        data = Path(path).read_bytes()
+        encoding = "utf-16" if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
+        return data.decode(encoding).splitlines()
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

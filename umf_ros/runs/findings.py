@@ -55,9 +55,14 @@ def _inputs(about: JudgedRun) -> Iterator[Advice]:
         yield Advice("warning", text)
 
 
-def _truth(about: JudgedRun) -> Iterator[Advice]:
+def about_truth(about: JudgedRun) -> Iterator[Advice]:
+    """Yield findings about the clock of the ground truth and its coverage."""
     run, (known, total) = about.run, about.covered
     if run.truth is None or not total:
+        return
+    if about.clock_offset_s:
+        what = f"the ground truth's clock is {about.clock_offset_s:+.1f} s off that of the odometry, by the motion"
+        yield Advice("fault", what, f"shift its stamps by {-about.clock_offset_s:+.1f} s; nothing was judged")
         return
     spans = [f"{stamps[0] * 1e-9:.1f} to {stamps[-1] * 1e-9:.1f} s" for stamps in (run.truth.stamps_ns, run.stamps)]
     if not known:
@@ -203,7 +208,7 @@ def _stated_errors(about: JudgedRun) -> Iterator[Advice]:
     median, inside = truth.get("nees_median"), truth.get("inside_95")
     words = "" if median is None or inside is None else in_words(median, inside)
     if words.startswith("too small"):
-        remedy = "the calibration's mounting or the odometry within a scan"
+        remedy = "the calibration's mounting, the odometry within a scan, or the clock of the ground truth"
         yield Advice("warning", f"stated errors of the closures are {words}", remedy)
 
 
@@ -312,7 +317,7 @@ def _clocks(lags: dict[str, float]) -> Iterator[Advice]:
         yield Advice("fault", what, "correct the stamps in its driver (PTP, or a constant): no parameter does")
 
 
-_CAUSES = (_truth, _gaps, lambda about: about_sensors(about.sensors), _disparity, _pairs, _inputs)
+_CAUSES = (about_truth, _gaps, lambda about: about_sensors(about.sensors), _disparity, _pairs, _inputs)
 _EFFECTS = (_graph, _absolute, _closures, _unjudged, _map, _stated_errors, _speed, _end)
 
 

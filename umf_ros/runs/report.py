@@ -29,7 +29,7 @@ from umf_ros.core.frames import Image, LoopClosure
 from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import write_atomically
 from umf_ros.pose_graph.closures import State
-from umf_ros.runs.findings import RunVerdict, conclude, look_first
+from umf_ros.runs.findings import RunVerdict, about_truth, conclude, look_first
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import Endpoints, read_inliers
 from umf_ros.runs.scene import (
@@ -309,10 +309,8 @@ def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> Judged
     if run.truth is not None:
         covered, total = judged.covered
         if not covered and total and run.summary["ground_truth"]:
-            raise UmfError(
-                f"the ground truth has another clock: it covers none of the {total} keyframes; {run.folder} was "
-                "judged before; nothing was written"
-            )
+            fault = next(about_truth(judged)).what
+            raise UmfError(f"{fault}; {run.folder} was judged before; nothing was written")
         run.summary["ground_truth"] = judged.summary() if covered or not total else None
     if keep:
         write_summary(run.folder, run.summary)

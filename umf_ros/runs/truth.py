@@ -10,18 +10,19 @@ from math import inf, isfinite, nan, radians
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from umf_ros.bags.reader import Bag
 from umf_ros.core.config import Loop
 from umf_ros.core.frames import LoopClosure
-from umf_ros.core.geometry import Array, align, heading, invert, relative, transform, wrap_angle
-from umf_ros.core.trajectory import Trajectory
+from umf_ros.core.geometry import Array, align, heading, interpolate, invert, relative, transform, wrap_angle
+from umf_ros.core.trajectory import Trajectory, bracket
 from umf_ros.places.database import is_past
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import Endpoints
+from umf_ros.sensors.motion_check import BETTER, CONTRAST
 from umf_ros.sensors.sensor_check import SensorReport
 from umf_ros.verification.hypothesis import Hypothesis
 
@@ -68,6 +69,11 @@ PLACE_RADIUS_M = 12.0
 PLACE_ANGLE_DEG = 30.0
 POSE_TOLERANCE_M = 0.5
 POSE_TOLERANCE_DEG = 5.0
+TRUTH_SHARE = 0.5
+"""By hand: largest error of an interpolated true pose, of the tolerances."""
+CHORDS_S, LAGS_S = np.tile([2.0, 16.0], 150), np.arange(-600, 601) / 10
+LEAST_OFFSET_S, COVERED = 0.3, 0.25
+"""By hand: least offset of a clock that is reported, and least share of the odometry that the truth covers then."""
 
 Stamps = NDArray[np.int64]
 
@@ -106,6 +112,7 @@ class JudgedRun:
         missed: stamps of keyframes that revisited a place and have no closure.
         bag: the recording, or None.
         sensors: consistency of the recording's measurements.
+        clock_offset_s: stamps of the truth minus those of the odometry; other than 0, nothing is judged.
     """
 
     run: FinishedRun
@@ -118,6 +125,7 @@ class JudgedRun:
     missed: list[int] = field(default_factory=list)
     bag: Bag | None = None
     sensors: SensorReport = field(default_factory=SensorReport)
+    clock_offset_s: float = 0.0
 
     def summary(self) -> dict[str, Any]:
         """Return the `ground_truth` entry of `summary.json`."""
@@ -154,7 +162,7 @@ class JudgedRun:
     def _true_poses(self) -> tuple[Array, NDArray[np.bool_]]:
         """True poses (N, 4, 4) of the keyframes, and (N,) whether each is known."""
         nowhere = Trajectory(np.empty(0, np.int64), np.empty((0, 4, 4)), has_orientation=False)
-        return (self.run.truth or nowhere).at(self.run.stamps)
+        return true_poses(nowhere if self.clock_offset_s else self.run.truth or nowhere, self.run.stamps)[:2]
 
     @cached_property
     def _rows(self) -> dict[int, int]:
@@ -194,18 +202,75 @@ class JudgedRun:
         return distance_m <= PLACE_RADIUS_M if isfinite(distance_m) else None
 
 
+def true_poses(truth: Trajectory, stamps: Stamps) -> tuple[Array, NDArray[np.bool_], Array]:
+    """Return poses (K, 4, 4) at stamps, (K,) whether each is known, and (K, 2) errors of interpolation, m and rad.
+
+    The errors follow from how far each sample is from the one interpolated without it. A pose whose error could make a
+    right closure look false is unknown.
+    """
+    poses, known = truth.at(stamps)
+    if len(truth) < 3:
+        return poses, known, np.zeros((len(stamps), 2))
+    past, future = np.diff(truth.stamps_ns[:-1]) * 1e-9, np.diff(truth.stamps_ns[1:]) * 1e-9
+    guesses = interpolate(truth.poses[:-2], truth.poses[2:], past / (past + future))
+    bends = np.pad(_sizes(relative(guesses, truth.poses[1:-1])) / (past * future), ((0, 0), (1, 1)), mode="edge")
+    before, after, share = bracket(truth.stamps_ns, stamps)
+    apart_s = (truth.stamps_ns[after] - truth.stamps_ns[before]) * 1e-9
+    errors = (np.maximum(bends[:, before], bends[:, after]) * share * (1 - share) * apart_s**2).T
+    limits = TRUTH_SHARE * np.array([POSE_TOLERANCE_M, radians(POSE_TOLERANCE_DEG)])
+    return poses, known & (errors <= limits).all(axis=1), errors
+
+
+def _sizes(poses: Array) -> Array:
+    """Return (2, N) lengths in m and angles in rad of poses (N, 4, 4)."""
+    return np.stack([np.linalg.norm(poses[:, :3, 3], axis=1), Rotation.from_matrix(poses[:, :3, :3]).magnitude()])
+
+
+def clock_offset(odometry: Trajectory | None, truth: Trajectory) -> float:
+    """Return seconds by which stamps of a truth are ahead of the odometry's, 0 unless the motion shows it clearly.
+
+    Distances that the odometry and the truth cover within some seconds are compared, which need no common frame.
+    """
+    if odometry is None or not len(odometry) or not len(truth):
+        return 0.0
+    start_ns, end_ns = odometry.stamps_ns[[0, -1]].tolist()
+    starts = np.linspace(0, max((end_ns - start_ns) * 1e-9 - max(CHORDS_S), 0), len(CHORDS_S))
+    driven = _chords(odometry, starts, start_ns)
+    differences = np.ma.masked_invalid(np.abs(_chords(truth, starts + LAGS_S[:, None], start_ns) - driven))
+    costs = np.ma.masked_where(differences.count(axis=1) < COVERED * len(CHORDS_S), differences.mean(axis=1))
+    # laps repeat the distances: of equal offsets the smallest
+    best = int(np.ma.argmin(costs * (1 + 0.01 * np.abs(LAGS_S))))
+    both = differences[[best, len(LAGS_S) // 2]]
+    moved, unmoved = np.ma.compress_cols(both).sum(axis=1)
+    clear = moved < BETTER * unmoved and costs[best] < CONTRAST * np.ma.median(costs)
+    return float(LAGS_S[best]) if clear and abs(LAGS_S[best]) >= LEAST_OFFSET_S else 0.0
+
+
+def _chords(path: Trajectory, starts_s: Array, origin_ns: int) -> Array:
+    """Return (...) distances from the positions at starts (...) to those `CHORDS_S` later, NaN outside."""
+    seconds, positions = (path.stamps_ns - origin_ns) * 1e-9, path.poses[:, :3, 3].T
+    begin, end = (
+        np.stack([np.interp(starts_s + later, seconds, axis, nan, nan) for axis in positions])
+        for later in (0, CHORDS_S)
+    )
+    return np.linalg.norm(end - begin, axis=0)
+
+
 def judge_run(run: FinishedRun, bag: Bag | None = None) -> JudgedRun:
     """Judge closures, odometry and optimised trajectory of a run by the truth, if there is one."""
     truth, rules = run.truth, run.settings.loop
     if truth is None:
         return JudgedRun(run, bag=bag)
-    poses, known = truth.at(run.stamps)
+    if offset_s := clock_offset(run.odometry, truth):
+        return JudgedRun(run, bag=bag, covered=(0, len(run.stamps)), clock_offset_s=offset_s)
+    poses, known, _ = true_poses(truth, run.stamps)
     keyframes, poses = run.keyframes[known], poses[known]
     stamps = keyframes["stamp_ns"]
-    ends, covered = truth.at(np.array([closure.endpoints for closure in run.closures], np.int64).ravel())
+    ends, covered, errors = true_poses(truth, np.array([one.endpoints for one in run.closures], np.int64).ravel())
     both = np.flatnonzero(covered.reshape(-1, 2).all(axis=1))
     query, match = ends.reshape(-1, 2, 4, 4)[both].swapaxes(0, 1)
-    judged = judge_closures([run.closures[row] for row in both], query, match, truth.has_orientation)
+    of_truth = errors.reshape(-1, 2, 2)[both]
+    judged = judge_closures([run.closures[row] for row in both], query, match, truth.has_orientation, of_truth)
     revisits = partial(find_revisits, stamps, poses, keyframes["path_length_m"], rules, sessions=keyframes["session"])
     again, same_view = revisits(same_view=False), revisits(same_view=truth.has_orientation)
     published = {closure.query_stamp_ns for closure in run.closures}
@@ -223,12 +288,17 @@ def judge_run(run: FinishedRun, bag: Bag | None = None) -> JudgedRun:
 
 
 def judge_closures(
-    closures: Sequence[LoopClosure], world_T_query: Array, world_T_match: Array, has_orientation: bool = True
+    closures: Sequence[LoopClosure],
+    world_T_query: Array,
+    world_T_match: Array,
+    has_orientation: bool = True,
+    of_truth: ArrayLike = 0.0,
 ) -> Judged:
     """Judge closures (K,) by the true poses (K, 4, 4) of their keyframes.
 
     True means: both keyframes within 12 m of each other [UMF 5.1.2], at any headings, and the published
-    relative pose within 0.5 m and 5 deg. A truth of positions alone (RTKLIB) checks distances only.
+    relative pose within 0.5 m and 5 deg. A truth of positions alone (RTKLIB) checks distances only. Its own errors at
+    both ends, `of_truth` (K, 2, 2) in m and rad, are allowed beyond these limits.
     """
     found: Judged = np.zeros(len(closures), JUDGED).view(np.recarray)
     if not closures:
@@ -237,15 +307,19 @@ def judge_closures(
     found.query_stamp_ns, found.match_stamp_ns = np.array([one.endpoints for one in closures], np.int64).T
     found.probability = [one.probability for one in closures]
     found.distance_m = np.linalg.norm(truth[:, :3, 3], axis=1)
+    (query_m, query_rad), (match_m, match_rad) = np.broadcast_to(of_truth, (len(closures), 2, 2)).transpose(1, 2, 0)
+    metres, turned = query_m + match_m + match_rad * found.distance_m, query_rad + match_rad
     if has_orientation:
         error = invert(truth) @ poses
         found.translation_error_m = np.linalg.norm(error[:, :3, 3], axis=1)
         found.rotation_error_deg = np.degrees(Rotation.from_matrix(error[:, :3, :3]).magnitude())
-        found.nees = normalised_errors(pose_error(poses, truth), np.stack([one.covariance for one in closures]))
+        own = np.repeat(np.stack([metres, turned], axis=1) ** 2, 3, axis=1)[:, None] * np.eye(6)
+        found.nees = normalised_errors(pose_error(poses, truth), np.stack([one.covariance for one in closures]) + own)
     else:
         found.translation_error_m = np.abs(np.linalg.norm(poses[:, :3, 3], axis=1) - found.distance_m)
         found.rotation_error_deg = found.nees = nan
-    pose_ok = (found.translation_error_m <= POSE_TOLERANCE_M) & ~(found.rotation_error_deg > POSE_TOLERANCE_DEG)
+    pose_ok = found.translation_error_m <= POSE_TOLERANCE_M + metres
+    pose_ok &= ~(found.rotation_error_deg > POSE_TOLERANCE_DEG + np.degrees(turned))
     found.is_true = (found.distance_m <= PLACE_RADIUS_M) & pose_ok
     return found
 

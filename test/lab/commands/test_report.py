@@ -243,7 +243,7 @@ def test_a_run_without_closures_and_trajectories(bag: Path, tmp_path: Path) -> N
         ("keyframes.csv", "stamp_ns,session,travelled_m\n5,0,1.5\n6,0\n", "keyframes.csv, line 3: not a row"),
         ("inliers.csv", "query_stamp_ns,match_stamp_ns,query_u\nx,2,3\n", "inliers.csv, line 2: not a row"),
         ("config.yaml", "loop: {topk: 3}\n", "unknown parameter loop.topk"),
-        ("trajectory_odometry.tum", "1.0 0 0 0\n", "trajectory_odometry.tum, line 1: expected 8 numbers"),
+        ("trajectory_odometry.tum", "1.0 0 0\n", "trajectory_odometry.tum, line 1: expected 8 numbers"),
     ],
 )
 def test_a_damaged_run_is_one_clear_line(run: Path, bag: Path, name: str, content: str | None, message: str) -> None:

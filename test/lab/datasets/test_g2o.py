@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import gtsam
@@ -20,9 +21,12 @@ from graph_worlds import (
 )
 
 from umf_ros.core.errors import GraphError, OutputError
-from umf_ros.core.geometry import adjoint, expmap, heading, invert, propagate
+from umf_ros.core.geometry import adjoint, expmap, heading, invert, make_pose, propagate, relative
 from umf_ros.core.trajectory import write_g2o
-from umf_ros.lab.datasets.g2o import Edge, G2oGraph, as_recording, drive, read_g2o, write_plane
+from umf_ros.lab.datasets.g2o import Edge, G2oGraph, read_g2o, write_plane
+from umf_ros.lab.datasets.graph_recording import as_recording, drive
+from umf_ros.lab.datasets.graph_units import in_units
+from umf_ros.lab.simulation.pose_graphs import rover_loops, with_wrong_closures
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import State
 
@@ -93,7 +97,7 @@ GOOD = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
         ("EDGE_SE2 0 1 nan 0 0 1 0 0 1 0 1", "not finite"),
         ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 -1", "not positive definite"),
         ("EDGE_SE2 1 1 1 0 0 1 0 0 1 0 1", "to itself"),
-        ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 2", "not a unit quaternion"),
+        (f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 0{' 0' * 21}", "quaternion of zeros"),
         ("VERTEX_SE2 -1 0 0 0", "negative vertex id"),
         ("HELLO world", "unknown tag HELLO"),
     ],
@@ -153,10 +157,13 @@ def test_ids_may_be_any_growing_numbers() -> None:
     assert accepted(driven_file(recording)) == {(c.first, c.second) for c in WORLD.closures if c.right}
 
 
+def _turned(edge: Edge) -> Edge:
+    return Edge(edge.second, edge.first, invert(edge.pose), propagate(adjoint(edge.pose), edge.covariance))
+
+
 def test_a_backward_edge_is_turned_round() -> None:
     content = content_of(WORLD)
-    turned = [Edge(e.second, e.first, invert(e.pose), propagate(adjoint(e.pose), e.covariance)) for e in content.edges]
-    recording = as_recording(G2oGraph(content.poses, turned))
+    recording = as_recording(G2oGraph(content.poses, [_turned(edge) for edge in content.edges]))
     np.testing.assert_allclose(recording.odometry, WORLD.odometry, atol=1e-9)
     expected = as_recording(content)
     for row in (0, 5):
@@ -164,9 +171,11 @@ def test_a_backward_edge_is_turned_round() -> None:
         np.testing.assert_allclose(recording.closures[row].covariance, expected.closures[row].covariance, atol=1e-9)
 
 
-def test_a_second_edge_between_neighbours_is_a_closure() -> None:
+def test_a_second_measurement_between_neighbours_is_a_closure_and_the_same_one_is_not() -> None:
     content = content_of(two_laps())
-    again = Edge(7, 8, content.edges[7].pose, content.edges[7].covariance)
+    first = content.edges[7]
+    again = first._replace(pose=first.pose @ make_pose(np.eye(3), [0.05, 0, 0]))
+    assert as_recording(G2oGraph(content.poses, [*content.edges, first, _turned(first)])).closures == []
     recording = as_recording(G2oGraph(content.poses, [*content.edges, again]))
     assert [(edge.first, edge.second) for edge in recording.closures] == [(7, 8)]
 
@@ -227,3 +236,128 @@ def test_a_flat_graph_with_unit_information_comes_to_its_optimum(tmp_path: Path)
     assert graph.scale.odometry == graph.scale.closures < 0.2
     assert graph.verdict_counts()["accepted"] == 34
     assert rms(graph.trajectory()[1], unguarded.trajectory()[1]) < 1e-3
+
+
+LAPS = closing(two_laps(), lap_pairs(*range(0, 90, 4)), noise=1.0)
+FALSE = closing(LAPS, [(20, 150), (33, 171), (52, 110)], (6.0, 0, 0))
+
+
+def _errors(content: G2oGraph) -> tuple[float, set[tuple[int, int]]]:
+    graph = driven_file(in_units(as_recording(content))[0])
+    return rms(graph.trajectory()[1], LAPS.truth), accepted(graph)
+
+
+def test_odometry_written_again_or_composed_over_several_poses_changes_nothing() -> None:
+    content = content_of(LAPS)
+    plain, right = _errors(content)
+    steps = [edge for edge in content.edges if edge.second == edge.first + 1]
+    longer = [
+        Edge(one.first, two.second, one.pose @ two.pose, one.covariance + two.covariance)
+        for one, two in pairwise(sorted(steps, key=lambda edge: edge.first))
+    ]
+    for more in (steps, [_turned(edge) for edge in steps], longer):
+        found, closures = _errors(G2oGraph(content.poses, [*content.edges, *more]))
+        assert found == pytest.approx(plain, rel=0.01) and closures == right
+
+
+def test_measured_edges_over_two_poses_are_odometry_and_improve_it() -> None:
+    rng = np.random.default_rng(4)
+    content = content_of(LAPS)
+    longer = []
+    for k in range(len(LAPS.truth) - 2):
+        covariance = LAPS.step_covariances[k + 1]
+        noise = expmap(rng.multivariate_normal(np.zeros(6), covariance)[None])[0]
+        longer.append(Edge(k, k + 2, relative(LAPS.truth[k], LAPS.truth[k + 2]) @ noise, covariance))
+    recording = as_recording(G2oGraph(content.poses, [*content.edges, *longer]))
+    assert len(recording.closures) == len(LAPS.closures)
+    assert rms(recording.odometry, LAPS.truth) < 0.6 * rms(LAPS.odometry, LAPS.truth)
+    # a wrong one is left to the back-end
+    longer[5] = longer[5]._replace(pose=longer[5].pose @ make_pose(np.eye(3), [3.0, 0, 0]))
+    recording = as_recording(G2oGraph(content.poses, [*content.edges, *longer]))
+    assert len(recording.closures) == len(LAPS.closures) + 1
+
+
+@pytest.mark.parametrize("decades", [-3, -2, 2, 3])
+def test_information_in_other_units_is_said_and_no_wrong_closure_is_accepted(decades: int) -> None:
+    plain, right = _errors(content_of(LAPS))
+    content = content_of(FALSE)
+    edges = [edge._replace(covariance=edge.covariance * 10.0 ** (2 * decades)) for edge in content.edges]
+    _, said = in_units(as_recording(G2oGraph(content.poses, edges)))
+    assert f"taken x {10.0**-decades:.2g}"[:9] in said
+    found, closures = _errors(G2oGraph(content.poses, edges))
+    assert found == pytest.approx(plain, rel=0.05) and closures == right
+
+
+def test_rotations_in_degrees_are_found() -> None:
+    content = content_of(FALSE)
+    scale = np.diag([np.degrees(1)] * 3 + [1] * 3)
+    edges = [edge._replace(covariance=scale @ edge.covariance @ scale) for edge in content.edges]
+    _, said = in_units(as_recording(G2oGraph(content.poses, edges)))
+    assert "rotations" in said
+    assert _errors(G2oGraph(content.poses, edges))[1] == _errors(content_of(LAPS))[1]
+
+
+def test_right_units_stay_as_they_are() -> None:
+    for world in (LAPS, FALSE, with_wrong_closures(rover_loops(300, 12), 0.6, "groups", 1)):
+        assert in_units(as_recording(content_of(world)))[1] == ""
+
+
+def test_robots_that_take_turns_in_numbering_are_chains(tmp_path: Path) -> None:
+    edges = [(k, k + 2) for k in range(18)] + [(0, 1), (6, 7), (12, 13)]
+    path = tmp_path / "two.g2o"
+    path.write_text("".join(f"EDGE_SE2 {a} {b} 1 0 0 1 0 0 1 0 1\n" for a, b in edges))
+    recording = as_recording(read_g2o(path))
+    assert recording.chains == [0, 10] and recording.ids[10] == 1
+    assert [(edge.first, edge.second) for edge in recording.closures] == [(0, 10), (3, 13), (6, 16)]
+
+
+SPACE = " ".join(str(x) for x in np.diag([1.0, 2, 3, 4, 5, 6])[np.triu_indices(6)])
+MOVED = "1 2 3 0.1 0 0 0.994987437"
+
+
+@pytest.mark.parametrize(
+    ("lines", "note"),
+    [
+        (f"EDGE_SE3:QUAT 0 1 {MOVED} {SPACE}", ""),
+        (f"EDGE_SE3:QUAT,0,1,{MOVED.replace(' ', ',')},{SPACE.replace(' ', ',')}", ""),
+        (f"EDGE_SE3:QUAT\t0\t1\t{MOVED} {SPACE}\r", ""),
+        (f"EDGE_SE3:QUAT 0 1 1 2 3 0.2 0 0 1.989974874 {SPACE}", ""),
+        (f"EDGE_SE3:QUAT 0 1 1 2 3 0.994987437 0.1 0 0 {SPACE}", "w first"),
+        ("EDGE_SE3:QUAT 0 1 " + MOVED + " " + " ".join(str(x) for x in np.diag([1, 2, 3, 4, 5, 6]).ravel()), ""),
+        (f"EDGE_SE3_SWITCHABLE 0 1 9 {MOVED} {SPACE}", ""),
+        (f"VERTEX_PLANE 5 0 0 1 0\nEDGE_SE3_PRIOR 0 0\nEDGE_SE3:QUAT 0 1 {MOVED} {SPACE}", "1 x VERTEX_PLANE"),
+        (f"VERTEX_SE3:QUAT 0 1 2 3 0 0 0 0\nEDGE_SE3:QUAT 0 1 {MOVED} {SPACE}", "1 vertices have no rotation"),
+    ],
+)
+def test_other_spellings_are_the_same_edge(tmp_path: Path, lines: str, note: str) -> None:
+    path = tmp_path / "a.g2o"
+    path.write_text(lines + "\n", encoding="utf-8-sig")
+    content = read_g2o(path)
+    (edge,) = content.edges
+    np.testing.assert_allclose(edge.pose[:3, 3], [1, 2, 3])
+    np.testing.assert_allclose(edge.pose[2, 1], 2 * 0.1 * 0.994987437, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.inv(edge.covariance), np.diag([4, 5, 6, 1, 2, 3]), atol=1e-9)
+    assert not content.problems and note in " ".join(content.notes) and bool(note) == bool(content.notes)
+
+
+@pytest.mark.parametrize("numbers", ["", " ".join(["nan"] * 21), "0 " * 20 + "0"])
+def test_edges_without_information_weigh_as_the_others(tmp_path: Path, numbers: str) -> None:
+    path = tmp_path / "a.g2o"
+    path.write_text(f"EDGE_SE3:QUAT 0 1 {MOVED} {SPACE}\nEDGE_SE3:QUAT 1 2 {MOVED} {numbers}\n")
+    content = read_g2o(path)
+    np.testing.assert_allclose(content.edges[1].covariance, content.edges[0].covariance)
+    assert "1 of 2 edges have no usable information" in content.notes[0]
+
+
+def test_an_unmeasured_direction_is_far_more_uncertain_than_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "a.g2o"
+    path.write_text("EDGE_SE2 0 1 1 0 0 100 0 0 100 0 0\n")
+    sigmas = np.sqrt(np.diag(read_g2o(path).edges[0].covariance))
+    assert sigmas[2] > 100 * sigmas[3] == pytest.approx(10)
+
+
+def test_a_file_with_edges_in_space_is_in_space(tmp_path: Path) -> None:
+    path = tmp_path / "a.g2o"
+    path.write_text(f"VERTEX_SE2 0 0 0 0\n{GOOD}EDGE_SE3:QUAT 1 2 {MOVED} {SPACE}\n")
+    content = read_g2o(path)
+    assert not content.planar and len(content.edges) == 2

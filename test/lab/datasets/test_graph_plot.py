@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from graph_worlds import closing, content_of, lap_pairs, two_laps
 
-from umf_ros.lab.datasets.g2o import G2oGraph, as_recording, plot_graph
+from umf_ros.lab.datasets.g2o import G2oGraph
+from umf_ros.lab.datasets.graph_recording import as_recording, plot_graph
 
 WORLD = closing(closing(two_laps(), lap_pairs(*range(0, 90, 6)), noise=1.0), lap_pairs(47), (5.0, 5.0, 0))
 

@@ -12,7 +12,7 @@ from umf_ros.core.errors import ConfigError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from umf_ros.lab.datasets.g2o import GraphRecording
+    from umf_ros.lab.datasets.graph_recording import GraphRecording
     from umf_ros.pose_graph.backend import PoseGraph
     from umf_ros.pose_graph.closures import ClosureVerdict
 
@@ -31,7 +31,11 @@ def optimize(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File for the optimised graph (g2o).")] = None,
     verdicts: Annotated[Path | None, typer.Option(help="File for the verdicts on all closures (CSV).")] = None,
 ) -> None:
-    """Pass a graph file through the back-end as if it came live, and print the rejected closures."""
+    """Pass a graph file through the back-end as if it came live, and print the rejected closures.
+
+    Edges between successive vertices are odometry, and so are many over the next few; repeated ones count once.
+    Units of the information that contradict the residuals by orders are found and said.
+    """
     if reject not in ("all", "none"):
         raise ConfigError(f"--reject {reject}: expected all or none")
 
@@ -39,15 +43,23 @@ def optimize(
     from rich.progress import track
 
     from umf_ros.core.config import PoseGraphSettings
-    from umf_ros.lab.datasets.g2o import as_recording, drive, read_g2o, write_optimised, write_verdicts_by_vertex
+    from umf_ros.lab.datasets.g2o import read_g2o
+    from umf_ros.lab.datasets.graph_recording import as_recording, drive, write_optimised, write_verdicts_by_vertex
+    from umf_ros.lab.datasets.graph_units import in_units
     from umf_ros.pose_graph.backend import PoseGraph
 
     console, content = Console(), read_g2o(file)
+    for note in content.notes:
+        console.print(f"[yellow]{note}", highlight=False)
     for problem in content.problems[:MOST_ROWS]:
         console.print(f"[yellow]skipped {problem}", highlight=False)
     if len(content.problems) > MOST_ROWS:
         console.print(f"[yellow]... and {len(content.problems) - MOST_ROWS} more lines")
     recording = as_recording(content)
+    if reject == "all":
+        recording, changed = in_units(recording)
+        if changed:
+            console.print(f"[yellow]{changed}", highlight=False)
     graph = PoseGraph(recording.settings(PoseGraphSettings(reject_outliers=reject == "all")))
     for _ in track(drive(graph, recording), "Optimising", console=console, transient=True):
         pass
@@ -65,7 +77,8 @@ def plot(
     output: Annotated[Path, typer.Option("--output", "-o", help="Picture to write.")] = Path("graph.png"),
 ) -> None:
     """Draw a graph file: odometry dark, closures green, from above and from the side."""
-    from umf_ros.lab.datasets.g2o import as_recording, plot_graph, read_g2o
+    from umf_ros.lab.datasets.g2o import read_g2o
+    from umf_ros.lab.datasets.graph_recording import as_recording, plot_graph
 
     content = read_g2o(file)
     plot_graph(as_recording(content), content.poses, output)

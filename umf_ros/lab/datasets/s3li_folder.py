@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from umf_ros.bags.trajectories import read_lines, read_rtklib
+from umf_ros.bags.trajectories import read_rtklib
 from umf_ros.core.errors import BagError, CalibrationError, ConfigError, UmfError
 from umf_ros.core.geometry import Array, invert, make_pose, rotation_angle, to_quaternion
-from umf_ros.core.io import read_yaml
+from umf_ros.core.io import read_lines, read_yaml
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.lab.datasets.s3li import ETNA_TEST, ETNA_TRAINING, load_pickle
 
@@ -83,7 +83,7 @@ def read_calde(path: Path) -> StereoFile:
     """
     cameras: dict[str, dict[str, str]] = {}
     try:
-        lines = read_lines(path)
+        lines = read_lines(path, BagError)
     except BagError as error:
         raise CalibrationError(str(error)) from None
     for line in lines:
