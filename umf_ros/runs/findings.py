@@ -19,7 +19,10 @@ from umf_ros.runs.diagnosis import ClosureDiagnosis, explain
 from umf_ros.runs.run_file import read_absolute_verdicts
 from umf_ros.runs.truth import JudgedRun, in_words
 
-REFUSED = ("size", "encoding", "step", "truncated", "compressed", "fields", "datatype", "unusable", "stamp")
+REFUSED = (
+    *("size", "encoding", "step", "truncated", "compressed", "fields", "datatype", "unusable", "stamp"),
+    *("camera_info", "transforms"),
+)
 """Reasons for which a message is unusable by itself."""
 MUCH_MISSED, MUCH_REJECTED, WELL_COVERED = 0.3, 0.2, 0.5
 """Shares, by hand: of revisits, of closures, of keyframes."""

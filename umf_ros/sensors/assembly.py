@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from umf_ros.core.geometry import Array, invert, relative, transform
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
+from umf_ros.sensors.point_times import LONGEST_SWEEP_NS
 from umf_ros.sensors.sessions import StampedInput
 
 Mask = NDArray[np.bool_]
@@ -182,16 +184,113 @@ class ScanLimits:
             self._warn(text)
 
 
+FEW, DECIDING = 100, 4
+"""Returns of a message by which it can be recognised as a part, and pairs of messages that decide (*by hand*)."""
+FASTEST_NS, PACKETS_NS, GAP = 20_000_000, 100_000_000, 3
+"""Shortest period of whole scans, length of a scan of packets, and longest gap in a scan in periods (*by hand*)."""
+
+
+class Scan(NamedTuple):
+    """A whole scan: the stamp of its first message, its returns, and the number of its messages."""
+
+    stamp_ns: int
+    cloud: Cloud
+    messages: int = 1
+
+
+class ScanJoiner:
+    """Joins the parts of scans, for drivers that publish sectors, bands or packets of a rotation.
+
+    The first messages decide whether there is anything to join: successive parts of a scan look in different
+    directions, packets follow each other faster than any LiDAR rotates. Each part keeps its own stamp.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[int, Cloud]] = []
+        self._seen: list[tuple[int, Mask]] = []
+        self._kind: Literal["", "whole", "parts", "packets"] = ""
+        self._period_ns = 0
+
+    def add(self, stamp_ns: int, cloud: Cloud) -> list[Scan]:
+        """Take the next message; return the scans that are known to be whole by now."""
+        if self._kind == "whole" or (not self._kind and len(cloud.points) < FEW):
+            return [Scan(stamp_ns, cloud)]
+        seen = _directions(cloud)
+        if not self._kind:
+            self._seen.append((stamp_ns, seen))
+            self._decide()
+            return [Scan(stamp_ns, cloud)]
+        done = self.flush() if self._waiting and self._begins(stamp_ns, seen) else []
+        self._waiting.append((stamp_ns, cloud))
+        self._seen.append((stamp_ns, seen))
+        return done
+
+    def flush(self) -> list[Scan]:
+        """Return the scan whose parts wait, at the end of a session."""
+        waiting, self._waiting, self._seen = self._waiting, [], []
+        return [_join(waiting)] if waiting else []
+
+    def _decide(self) -> None:
+        """Decide by the messages so far, if they suffice."""
+        if len(self._seen) < 2:
+            return
+        self._period_ns = int(np.median(np.diff([stamp_ns for stamp_ns, _ in self._seen])))
+        apart = not _overlap(self._seen[-1][1], self._seen[-2][1])
+        if self._period_ns >= FASTEST_NS and not apart:
+            self._kind = "whole"
+        elif len(self._seen) > DECIDING:
+            self._kind, self._seen = "parts" if apart else "packets", []
+
+    def _begins(self, stamp_ns: int, seen: Mask) -> bool:
+        """Return whether a message begins a new scan."""
+        longest_ns = PACKETS_NS if self._kind == "packets" else LONGEST_SWEEP_NS
+        if stamp_ns - self._waiting[-1][0] > GAP * self._period_ns:
+            return True
+        if stamp_ns - self._waiting[0][0] > longest_ns - self._period_ns // 2:
+            return True
+        return self._kind == "parts" and _overlap(seen, np.logical_or.reduce([one for _, one in self._seen]))
+
+
+def _directions(cloud: Cloud) -> Mask:
+    """Return the directions (73, 73), by 5 deg around and 2.5 deg up, in which a message has returns."""
+    x, y, z = cloud.points.T
+    around, up = np.degrees(np.arctan2(y, x)) / 5 + 36, np.degrees(np.arctan2(z, np.hypot(x, y))) / 2.5 + 36
+    seen = np.zeros((73, 73), bool)
+    seen[around.astype(int), up.astype(int)] = True
+    return seen
+
+
+def _overlap(one: Mask, other: Mask) -> bool:
+    """Return whether most directions of one of two messages are also those of the other."""
+    return bool(np.count_nonzero(one & other) > 0.5 * min(np.count_nonzero(one), np.count_nonzero(other)))
+
+
+def _join(parts: Sequence[tuple[int, Cloud]]) -> Scan:
+    clouds, first_ns = [cloud for _, cloud in parts], parts[0][0]
+    strengths = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
+    offsets = [
+        np.zeros(len(one.points), np.int64) if one.time_offset_ns is None else one.time_offset_ns for one in clouds
+    ]
+    cloud = Cloud(
+        np.concatenate([cloud.points for cloud in clouds]),
+        np.concatenate(strengths) if len(strengths) == len(clouds) else None,
+        np.concatenate([offset + part[0] - first_ns for offset, part in zip(offsets, parts, strict=True)]),
+    )
+    return Scan(first_ns, cloud, len(parts))
+
+
 @dataclass(frozen=True, slots=True)
 class Anchor:
     """The measurement a frame is built around: a scan in the LiDAR frame, or an image where there is no LiDAR.
 
     `stamp_ns` is the key of the frame, `measured_ns` the stamp of the message: time offsets of points count from there.
+    `messages` is the number of the scan's.
     """
 
     stamp_ns: int
     measured_ns: int
     cloud: Cloud | None = None
+    messages: int = 1
 
     def span_ns(self) -> tuple[int, int]:
         """Return stamps of the first and the last point; the key where the driver sends no times."""

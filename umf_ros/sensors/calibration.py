@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,6 +24,20 @@ LARGEST_IMAGE = 20_000
 """Pixels of a side."""
 
 
+class SensorWindow(NamedTuple):
+    """Part of the full sensor that an image shows: its offset and size in pixels of the sensor, and the binning."""
+
+    sensor: tuple[int, int]
+    offset: tuple[int, int]
+    part: tuple[int, int]
+    binning: tuple[int, int]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image."""
+        return self.part[0] // self.binning[0], self.part[1] // self.binning[1]
+
+
 class Pinhole(Group):
     """Intrinsics in pixels."""
 
@@ -35,16 +50,28 @@ class Pinhole(Group):
 
 
 class RawCamera(Pinhole):
-    """A camera with lens distortion: k1 k2 p1 p2 k3 k4 k5 k6 as far as known."""
+    """A camera with lens distortion, in OpenCV's order.
+
+    `radtan`: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty as far as known; `equidistant`, a fisheye: k1 k2 k3 k4.
+    """
 
     distortion: tuple[float, ...]
+    distortion_model: Literal["radtan", "equidistant"] = "radtan"
 
-    @field_validator("distortion")
-    @classmethod
-    def _in_opencv_order(cls, distortion: tuple[float, ...]) -> tuple[float, ...]:
-        if len(distortion) not in (0, 4, 5, 8):
-            raise ValueError("expected 0, 4, 5 or 8 coefficients: k1 k2 p1 p2 k3 k4 k5 k6")
-        return distortion
+    @model_validator(mode="after")
+    def _in_opencv_order(self) -> RawCamera:
+        counts = (0, 4) if self.distortion_model == "equidistant" else (0, 4, 5, 8, 12, 14)
+        if len(self.distortion) not in counts:
+            expected = ", ".join(map(str, counts))
+            raise ValueError(f"{self.distortion_model}: expected one of {expected} coefficients, in OpenCV's order")
+        return self
+
+    def within(self, window: SensorWindow) -> RawCamera:
+        """Return the camera of images that show a window of this one."""
+        (x, y), (across, down), (width, height) = window.offset, window.binning, window.size
+        values = {"width": width, "height": height, "fx": self.fx / across, "fy": self.fy / down}
+        centre = {"cx": (self.cx - x + 0.5) / across - 0.5, "cy": (self.cy - y + 0.5) / down - 0.5}
+        return self.model_copy(update=values | centre)
 
     def matrix(self, size: tuple[int, int]) -> Array:
         """Return (3, 3) intrinsics of the image scaled to `size`; pixel (0, 0) is a pixel's centre."""
@@ -62,23 +89,31 @@ class StereoRectifier:
     def __init__(self, left: RawCamera, right: RawCamera, left_T_right: Array, size: tuple[int, int]) -> None:
         """Prepare the maps; `size` is the width and height of the result."""
         self.raw_size = (left.width, left.height)
-        self._size = size
+        self._size, self._pair = size, (left, right, left_T_right)
         right_T_left = invert(left_T_right)
         matrices = [camera.matrix(size) for camera in (left, right)]
         distortions = [np.array(camera.distortion or (0.0,) * 4) for camera in (left, right)]
         both = matrices[0], distortions[0], matrices[1], distortions[1]
-        turn, shift = right_T_left[:3, :3], right_T_left[:3, 3:]
         # Bouguet's method, without black borders
-        result = cv2.stereoRectify(*both, size, turn, shift, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)
+        options, functions = {"flags": cv2.CALIB_ZERO_DISPARITY, "alpha": 0}, cv2
+        if left.distortion_model == "equidistant":
+            options, functions = {"flags": cv2.CALIB_ZERO_DISPARITY, "balance": 0.0}, cv2.fisheye
+        result = functions.stereoRectify(*both, size, right_T_left[:3, :3], right_T_left[:3, 3:], **options)
         turns, projections = result[:2], result[2:4]
         self._maps = [
-            cv2.initUndistortRectifyMap(matrix, distortion, turn, projection[:, :3], size, cv2.CV_16SC2)
+            functions.initUndistortRectifyMap(matrix, distortion, turn, projection[:, :3], size, cv2.CV_16SC2)
             for matrix, distortion, turn, projection in zip(matrices, distortions, turns, projections, strict=True)
         ]
         self.raw_T_rectified = make_pose(turns[0].T, (0, 0, 0))
         fx, fy, cx, cy = (float(projections[0][i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
         baseline = -float(projections[1][0, 3]) / fx
         self.camera = StereoCamera(*size, fx, fy, cx, cy, baseline)
+
+    def within(self, window: SensorWindow) -> StereoRectifier:
+        """Return the rectification of raw images that show a window of these."""
+        left, right, left_T_right = self._pair
+        shown = [min(round(s * p / f), i) for s, p, f, i in zip(self._size, window.part, self.raw_size, window.size)]
+        return StereoRectifier(left.within(window), right.within(window), left_T_right, (shown[0], shown[1]))
 
     def apply(self, raw: Image, side: int) -> Image:
         """Return the rectified image, (H, W) uint8, of a raw one; `side` 0: left, 1: right."""
@@ -119,6 +154,19 @@ class Calibration:
     def image_size(self) -> tuple[int, int]:
         """Width and height of the images that arrive."""
         return self.rectifier.raw_size if self.rectifier else (self.camera.width, self.camera.height)
+
+    def within(self, window: SensorWindow, size: tuple[int, int]) -> Calibration:
+        """Return the calibration for images of `size` that show a window of the sensor; itself if they do not."""
+        if window.size != size or window.sensor != self.image_size:
+            return self
+        if self.rectifier is not None:
+            rectifier = self.rectifier.within(window)
+            return replace(self, rectifier=rectifier, camera=rectifier.camera)
+        one = self.camera
+        part = RawCamera(**{name: getattr(one, name) for name in Pinhole.model_fields}, distortion=()).within(window)
+        return replace(
+            self, camera=StereoCamera(part.width, part.height, part.fx, part.fy, part.cx, part.cy, one.baseline)
+        )
 
     def with_camera(self, camera: StereoCamera) -> Calibration:
         """Return this calibration with the intrinsics of a camera_info; a baseline of 0 keeps the one known here."""
@@ -192,6 +240,12 @@ class _RawPair(Group):
     left_T_right: _Pose
     width: int = Field(gt=0, le=LARGEST_IMAGE)
     height: int = Field(gt=0, le=LARGEST_IMAGE)
+
+    @model_validator(mode="after")
+    def _of_one_model(self) -> _RawPair:
+        if self.left.distortion_model != self.right.distortion_model:
+            raise ValueError("both cameras need the same distortion_model")
+        return self
 
 
 class _File(Group):
