@@ -6,7 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from recordings import POINT, START_NS, camera_info, cloud, drive, image, odometry, scan
+from recordings import POINT, START_NS, camera_info, cloud, drive, image, make, odometry, scan
 
 from umf_ros.core.errors import MessageError
 from umf_ros.sensors.decode import (
@@ -273,10 +273,80 @@ def test_uncalibrated_camera_info_is_refused(changes: dict[str, Any]) -> None:
     assert kind_of(decode_camera_info, camera_info(0, 579.5, (688, 512), **changes)) == "camera_info"
 
 
-@pytest.mark.parametrize("baseline", [0.0, -0.2])
-def test_pair_without_a_baseline_is_refused(baseline: float) -> None:
-    left, right = camera_info(0, 579.5, (688, 512)), camera_info(0, 579.5, (688, 512), baseline=baseline)
-    assert kind_of(decode_camera_info, left, right) == "camera_info"
+def window(offset: tuple[int, int] = (0, 0), part: tuple[int, int] = (0, 0), binning: int = 0) -> dict[str, Any]:
+    region = {"x_offset": offset[0], "y_offset": offset[1], "width": part[0], "height": part[1], "do_rectify": True}
+    return {"binning_x": binning, "binning_y": binning, "roi": make("sensor_msgs/msg/RegionOfInterest", **region)}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "focal", "centre", "changes", "size", "expected"),
+    [
+        ((1376, 1024), 1159.0, (688.0, 512.0), window(binning=2), None, (688, 512, 579.5, 344, 256)),
+        (
+            (1376, 1024),
+            579.5,
+            (344.0, 256.0),
+            window(binning=2),
+            None,
+            (688, 512, 579.5, 344, 256),
+        ),  # the Mako's driver
+        ((788, 572), 579.5, (384.0, 286.0), window((40, 30), (688, 512)), None, (688, 512, 579.5, 344, 256)),
+        ((788, 572), 579.5, (384.0, 286.0), window((40, 30), (688, 512), 1), None, (688, 512, 579.5, 344, 256)),
+        ((1576, 1144), 1159.0, (768.0, 572.0), window((80, 60), (1376, 1024), 2), None, (688, 512, 579.5, 344, 256)),
+        ((688, 512), 579.5, (344.0, 256.0), window(part=(688, 512)), None, (688, 512, 579.5, 344, 256)),
+        ((688, 512), 579.5, (344.0, 256.0), window((0, 256), (688, 256)), None, (688, 256, 579.5, 344, 0)),
+        # flags of another mode than the images'
+        ((688, 512), 579.5, (344.0, 256.0), window(binning=2), (688, 512), (688, 512, 579.5, 344, 256)),
+    ],
+)
+def test_binning_and_region_are_those_of_rep_104(
+    sensor: Any, focal: float, centre: Any, changes: Any, size: Any, expected: Any
+) -> None:
+    k = np.array([focal, 0, centre[0], 0, focal, centre[1], 0, 0, 1])
+    p = np.insert(k.astype(float), [3, 6, 9], 0)
+    right = p.copy()
+    right[3] = -focal * 0.2
+    infos = [camera_info(0, focal, sensor, **{"k": k, "p": one, **changes}) for one in (p, right)]
+    camera = decode_camera_info(*infos, size)
+    assert (camera.width, camera.height, camera.fx, camera.cx, camera.cy) == pytest.approx(expected)
+    assert camera.fy == camera.fx and camera.baseline == pytest.approx(0.2)
+
+
+def with_p(stereo: float, **places: float) -> Any:
+    info = camera_info(0, 579.5, (688, 512), baseline=stereo)
+    for place, value in places.items():
+        info.p[int(place[1:])] = value
+    return info
+
+
+@pytest.mark.parametrize(
+    ("right", "text"),
+    [
+        ({"stereo": 0.0}, "baseline of -?0 m"),
+        ({"stereo": -0.2}, "baseline of -0.2 m, by its P.3. of 115.9"),
+        ({"stereo": 0.2, "p3": -0.2}, "baseline of 0.0003451 m, by its P.3. of -0.2, which is -fx . metres"),
+        ({"stereo": 0.2, "p0": 583.2}, "not of one rectified pair: fx 579.5, .* and fx 583.2"),
+        ({"stereo": 0.2, "p2": 318.0}, "not of one rectified pair: .*cx 318.0"),
+    ],
+)
+def test_pair_without_a_baseline_is_refused(right: dict[str, float], text: str) -> None:
+    with pytest.raises(MessageError, match=text) as caught:
+        decode_camera_info(camera_info(0, 579.5, (688, 512)), with_p(**right))
+    assert caught.value.kind == "camera_info" and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "text"),
+    [
+        ({"stereo": -0.2}, {"stereo": 0.0}, ""),  # the right camera is the origin
+        ({"stereo": 0.2}, {"stereo": 0.2}, "0.2 m is taken as the baseline"),  # Gazebo
+        ({"stereo": 0.0, "p1": -52.4}, {"stereo": 0.2, "p1": -52.4}, "not that of a rectified camera: P[1] is -52.4"),
+    ],
+)
+def test_unusual_pairs_are_used_and_told(left: dict[str, float], right: dict[str, float], text: str) -> None:
+    told: list[str] = []
+    assert decode_camera_info(with_p(**left), with_p(**right), None, told.append).baseline == pytest.approx(0.2)
+    assert len(told) == bool(text) and all(text in line for line in told)
 
 
 def test_messages_of_rclpy_are_the_same(rng: np.random.Generator) -> None:

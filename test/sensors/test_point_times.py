@@ -82,7 +82,7 @@ def test_a_counter_that_overflows_within_a_scan_starts_at_the_stamp() -> None:
 def test_ptp_is_37_s_ahead() -> None:
     told, found = told_and_found(lambda o, s: s + o + 37 * S, "<u8")
     assert found.tolist() == SWEEP_NS.tolist()
-    assert told == ["times of points and stamps of scans are 37 s (TAI and UTC) apart: corrected"]
+    assert not told
 
 
 def test_another_clock_keeps_the_shape_of_a_scan() -> None:

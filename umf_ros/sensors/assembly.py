@@ -186,6 +186,8 @@ class ScanLimits:
 
 FEW, DECIDING = 100, 4
 """Returns of a message by which it can be recognised as a part, and pairs of messages that decide (*by hand*)."""
+SAME, SECTORS = 0.5, 0.3
+"""Overlap of directions above which messages see the same, and below which fast ones are sectors (*by hand*)."""
 FASTEST_NS, PACKETS_NS, GAP = 20_000_000, 100_000_000, 3
 """Shortest period of whole scans, length of a scan of packets, and longest gap in a scan in periods (*by hand*)."""
 
@@ -206,8 +208,7 @@ class ScanJoiner:
     """
 
     def __init__(self) -> None:
-        self._waiting: list[tuple[int, Cloud]] = []
-        self._seen: list[tuple[int, Mask]] = []
+        self._parts: list[tuple[int, Cloud, Mask]] = []
         self._kind: Literal["", "whole", "parts", "packets"] = ""
         self._period_ns = 0
 
@@ -215,68 +216,64 @@ class ScanJoiner:
         """Take the next message; return the scans that are known to be whole by now."""
         if self._kind == "whole" or (not self._kind and len(cloud.points) < FEW):
             return [Scan(stamp_ns, cloud)]
-        seen = _directions(cloud)
-        if not self._kind:
-            self._seen.append((stamp_ns, seen))
+        part = stamp_ns, cloud, _directions(cloud)
+        undecided = not self._kind
+        done = self.flush() if not undecided and self._parts and self._begins(stamp_ns, part[2]) else []
+        self._parts.append(part)
+        if undecided:
             self._decide()
-            return [Scan(stamp_ns, cloud)]
-        done = self.flush() if self._waiting and self._begins(stamp_ns, seen) else []
-        self._waiting.append((stamp_ns, cloud))
-        self._seen.append((stamp_ns, seen))
-        return done
+        return [Scan(stamp_ns, cloud)] if undecided else done
 
     def flush(self) -> list[Scan]:
         """Return the scan whose parts wait, at the end of a session."""
-        waiting, self._waiting, self._seen = self._waiting, [], []
-        return [_join(waiting)] if waiting else []
+        parts, self._parts = self._parts if self._kind else [], []
+        return [_join(parts)] if parts else []
 
     def _decide(self) -> None:
-        """Decide by the messages so far, if they suffice."""
-        if len(self._seen) < 2:
+        """Decide by the messages so far, if they suffice; they were used one by one."""
+        if len(self._parts) < 2:
             return
-        self._period_ns = int(np.median(np.diff([stamp_ns for stamp_ns, _ in self._seen])))
-        apart = not _overlap(self._seen[-1][1], self._seen[-2][1])
-        if self._period_ns >= FASTEST_NS and not apart:
-            self._kind = "whole"
-        elif len(self._seen) > DECIDING:
-            self._kind, self._seen = "parts" if apart else "packets", []
+        self._period_ns = int(np.median(np.diff([stamp_ns for stamp_ns, *_ in self._parts])))
+        fast = self._period_ns < FASTEST_NS
+        apart = _overlap(self._parts[-1][2], self._parts[-2][2]) < (SECTORS if fast else SAME)
+        if not fast and not apart:
+            self._kind, self._parts = "whole", []
+        elif len(self._parts) > DECIDING:
+            self._kind, self._parts = "parts" if apart else "packets", []
 
     def _begins(self, stamp_ns: int, seen: Mask) -> bool:
         """Return whether a message begins a new scan."""
         longest_ns = PACKETS_NS if self._kind == "packets" else LONGEST_SWEEP_NS
-        if stamp_ns - self._waiting[-1][0] > GAP * self._period_ns:
+        if stamp_ns - self._parts[-1][0] > GAP * self._period_ns:
             return True
-        if stamp_ns - self._waiting[0][0] > longest_ns - self._period_ns // 2:
+        if stamp_ns - self._parts[0][0] > longest_ns - self._period_ns // 2:
             return True
-        return self._kind == "parts" and _overlap(seen, np.logical_or.reduce([one for _, one in self._seen]))
+        return self._kind == "parts" and _overlap(seen, np.logical_or.reduce([one for *_, one in self._parts])) > SAME
 
 
 def _directions(cloud: Cloud) -> Mask:
-    """Return the directions (73, 73), by 5 deg around and 2.5 deg up, in which a message has returns."""
+    """Return the directions (37, 73), by 10 deg around and 2.5 deg up, in which a message has returns."""
     x, y, z = cloud.points.T
-    around, up = np.degrees(np.arctan2(y, x)) / 5 + 36, np.degrees(np.arctan2(z, np.hypot(x, y))) / 2.5 + 36
-    seen = np.zeros((73, 73), bool)
+    around, up = np.degrees(np.arctan2(y, x)) / 10 + 18, np.degrees(np.arctan2(z, np.hypot(x, y))) / 2.5 + 36
+    seen = np.zeros((37, 73), bool)
     seen[around.astype(int), up.astype(int)] = True
     return seen
 
 
-def _overlap(one: Mask, other: Mask) -> bool:
-    """Return whether most directions of one of two messages are also those of the other."""
-    return bool(np.count_nonzero(one & other) > 0.5 * min(np.count_nonzero(one), np.count_nonzero(other)))
+def _overlap(one: Mask, other: Mask) -> float:
+    """Return the share of the directions of one of two messages, the narrower one, that are also the other's."""
+    return np.count_nonzero(one & other) / max(1, min(np.count_nonzero(one), np.count_nonzero(other)))
 
 
-def _join(parts: Sequence[tuple[int, Cloud]]) -> Scan:
-    clouds, first_ns = [cloud for _, cloud in parts], parts[0][0]
-    strengths = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
+def _join(parts: Sequence[tuple[int, Cloud, Mask]]) -> Scan:
+    first_ns, points = parts[0][0], np.concatenate([cloud.points for _, cloud, _ in parts])
+    strengths = [cloud.intensity for _, cloud, _ in parts if cloud.intensity is not None]
     offsets = [
-        np.zeros(len(one.points), np.int64) if one.time_offset_ns is None else one.time_offset_ns for one in clouds
+        np.full(len(cloud.points), stamp_ns - first_ns) + (0 if cloud.time_offset_ns is None else cloud.time_offset_ns)
+        for stamp_ns, cloud, _ in parts
     ]
-    cloud = Cloud(
-        np.concatenate([cloud.points for cloud in clouds]),
-        np.concatenate(strengths) if len(strengths) == len(clouds) else None,
-        np.concatenate([offset + part[0] - first_ns for offset, part in zip(offsets, parts, strict=True)]),
-    )
-    return Scan(first_ns, cloud, len(parts))
+    intensity = np.concatenate(strengths) if len(strengths) == len(parts) else None
+    return Scan(first_ns, Cloud(points, intensity, np.concatenate(offsets)), len(parts))
 
 
 @dataclass(frozen=True, slots=True)

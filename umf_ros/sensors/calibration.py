@@ -98,8 +98,13 @@ class StereoRectifier:
         options, functions = {"flags": cv2.CALIB_ZERO_DISPARITY, "alpha": 0}, cv2
         if left.distortion_model == "equidistant":
             options, functions = {"flags": cv2.CALIB_ZERO_DISPARITY, "balance": 0.0}, cv2.fisheye
-        result = functions.stereoRectify(*both, size, right_T_left[:3, :3], right_T_left[:3, 3:], **options)
+        turn, shift = right_T_left[:3, :3].copy(), right_T_left[:3, 3:].copy()  # contiguous, as fisheye wants them
+        result = functions.stereoRectify(*both, size, turn, shift, **options)
         turns, projections = result[:2], result[2:4]
+        # a fisheye's whole view is too wide for a plane: its centre keeps its resolution
+        larger = max(1.0, matrices[0][0, 0] / projections[0][0, 0]) if functions is cv2.fisheye else 1.0
+        for projection in projections:
+            projection[[0, 1, 0], [0, 1, 3]] *= larger
         self._maps = [
             functions.initUndistortRectifyMap(matrix, distortion, turn, projection[:, :3], size, cv2.CV_16SC2)
             for matrix, distortion, turn, projection in zip(matrices, distortions, turns, projections, strict=True)
@@ -112,8 +117,9 @@ class StereoRectifier:
     def within(self, window: SensorWindow) -> StereoRectifier:
         """Return the rectification of raw images that show a window of these."""
         left, right, left_T_right = self._pair
-        shown = [min(round(s * p / f), i) for s, p, f, i in zip(self._size, window.part, self.raw_size, window.size)]
-        return StereoRectifier(left.within(window), right.within(window), left_T_right, (shown[0], shown[1]))
+        (width, height), (across, down) = window.size, (self.raw_size[i] / self._size[i] for i in (0, 1))
+        size = min(width, round(window.part[0] / across)), min(height, round(window.part[1] / down))
+        return StereoRectifier(left.within(window), right.within(window), left_T_right, size)
 
     def apply(self, raw: Image, side: int) -> Image:
         """Return the rectified image, (H, W) uint8, of a raw one; `side` 0: left, 1: right."""
@@ -157,7 +163,7 @@ class Calibration:
 
     def within(self, window: SensorWindow, size: tuple[int, int]) -> Calibration:
         """Return the calibration for images of `size` that show a window of the sensor; itself if they do not."""
-        if window.size != size or window.sensor != self.image_size:
+        if size == self.image_size or (window.size, window.sensor) != (size, self.image_size):
             return self
         if self.rectifier is not None:
             rectifier = self.rectifier.within(window)

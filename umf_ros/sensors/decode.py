@@ -108,7 +108,7 @@ def stamp_ns(message: Any) -> int:
 
 
 class GreyRange:
-    """The range of 16-bit grey values of a rig's cameras, which sensors of 10, 12 or 14 bits and thermal ones use in part.
+    """Range of 16-bit grey values of a rig's cameras; sensors of 10, 12 or 14 bits and thermal ones use a part.
 
     It is a power of two and only grows, when an image leaves it, so that the brightness does not flicker.
     """
@@ -279,10 +279,10 @@ def decode_camera_info(
     Raises:
         MessageError: of kind "camera_info": no calibrated camera, or no pair.
     """
-    camera, matrix = _as_imaged(left, "left", size)
+    camera, matrix = _as_imaged(left, size)
     if right is None:
         return camera
-    other, other_matrix = _as_imaged(right, "right", None)
+    other, other_matrix = _as_imaged(right, size)
     apart = [abs(one - another) for one, another in ((camera.cx, other.cx), (camera.cy, other.cy))]
     if max(apart) > _SAME_PX or abs(other.fx / camera.fx - 1) > _SAME_SHARE:
         numbers = " and ".join(f"fx {one.fx:.1f}, cx {one.cx:.1f}, cy {one.cy:.1f}" for one in (camera, other))
@@ -307,10 +307,10 @@ def window_of(info: Any) -> SensorWindow:
     return SensorWindow((int(info.width), int(info.height)), (int(roi.x_offset), int(roi.y_offset)), part, binning)
 
 
-def _as_imaged(info: Any, name: str, size: tuple[int, int] | None) -> tuple[StereoCamera, Array]:
+def _as_imaged(info: Any, size: tuple[int, int] | None) -> tuple[StereoCamera, Array]:
     """Return the camera of the images, without a baseline, and P (3, 4) as it is in the message."""
-    matrix, window = _projection(info, name), window_of(info)
-    (x, y), (across, down), (width, height) = window.offset, window.binning, window.sensor
+    matrix, window = _projection(info), window_of(info)
+    (x, y), (across, down), width = window.offset, window.binning, window.sensor[0]
     if size == window.sensor != window.size:  # of all pixels in spite of them
         (x, y), (across, down), window = (0, 0), (1, 1), window._replace(part=window.sensor, binning=(1, 1))
     fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -319,21 +319,21 @@ def _as_imaged(info: Any, name: str, size: tuple[int, int] | None) -> tuple[Ster
     return StereoCamera(*window.size, fx / across, fy / down, (cx - x) / across, (cy - y) / down, 0.0), matrix
 
 
-def _projection(info: Any, name: str) -> Array:
+def _projection(info: Any) -> Array:
     """Return (3, 4) projection of the rectified image; from K where the driver leaves P empty."""
     if max(info.width, info.height) > LARGEST_IMAGE:
-        raise MessageError("camera_info", f"{name} camera_info for {info.width} x {info.height} pixels")
+        raise MessageError("camera_info", f"camera_info for {info.width} x {info.height} pixels")
     matrix = np.array(info.p, dtype=float).reshape(3, 4)
     if not matrix.any():
         matrix[:, :3] = np.array(info.k, dtype=float).reshape(3, 3)
     width, height, fx, fy = float(info.width), float(info.height), matrix[0, 0], matrix[1, 1]
     if not (np.isfinite(matrix).all() and min(width, height, fx, fy) > 0):
-        raise MessageError("camera_info", f"{name} camera_info is not calibrated")
+        raise MessageError("camera_info", "camera_info is not calibrated")
     views = [2 * np.arctan2(size / 2, focal) for size, focal in ((width, fx), (height, fy))]
     centre = 0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height
     if not (all(NARROWEST_RAD < view < WIDEST_RAD for view in views) and 0.5 < fx / fy < 2 and centre):
         numbers = f"{width:.0f} x {height:.0f} pixels, fx {fx:.3g}, fy {fy:.3g}, centre {matrix[0, 2]:.3g}"
-        raise MessageError("camera_info", f"{name} camera_info of no real camera: {numbers}, {matrix[1, 2]:.3g}")
+        raise MessageError("camera_info", f"camera_info of no real camera: {numbers}, {matrix[1, 2]:.3g}")
     return matrix
 
 

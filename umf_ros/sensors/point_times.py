@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 TIME_NAMES = (
-    *("point_time_offset", "offset_time", "time_offset", "t", "time", "timestamp", "time_stamp", "ts", "timestamps"),
-    *("relative_time", "rel_time", "relative_timestamp", "point_time", "timestamp_ns", "time_offset_ns", "timeoffset"),
-)
-"""Fields of the time of a point, by driver: Blickfeld, Livox, Ouster, Velodyne, Hesai, RoboSense, Autoware, SICK, Aeva."""
+    "point_time_offset offset_time time_offset t time timestamp time_stamp ts timestamps relative_time rel_time "
+    "relative_timestamp point_time timestamp_ns time_offset_ns timeoffset"
+).split()
+"""Fields of the time of a point by Blickfeld, Livox, Ouster, Velodyne, Hesai, RoboSense, Autoware, SICK, Aeva, ..."""
 LONGEST_SWEEP_NS = 1_000_000_000
 _UNITS = (10**9, 10**6, 10**3, 1)
 _RATIO = 1000
@@ -24,8 +24,8 @@ _COARSEST_NS = 10_000_000
 """Coarsest steps of times that are used (by hand): a rover moves some millimetres."""
 _RECENT, _ENOUGH = 15, 100
 """Scans whose spans decide together, and the least returns of each (by hand)."""
-_SINCE_EPOCH_NS, _CLOCKS_NS = 10**15, 100 * 10**9
-"""Stamps before are of a simulation; largest difference of two clocks that count from the epoch."""
+_CLOCKS_NS = 100 * 10**9
+"""Largest difference of two clocks that count from the epoch (by hand). Stamps up to 1000 times that are simulated."""
 _TAI_NS = 37 * 10**9
 """PTP's time scale is ahead of UTC by the leap seconds."""
 _WRAP = 2**32
@@ -41,9 +41,8 @@ class PointTimes:
     """
 
     def __init__(self, warn: Callable[[str], None] = lambda _: None) -> None:
-        """Call `warn` with one line when times cannot be used as they are, once for each reason."""
-        self._warn = warn
-        self._warned: set[str] = set()
+        """Call `warn` with one line, the first time that times cannot be used as they are."""
+        self._warn: Callable[[str], None] | None = warn
         self._spans, self._periods = deque[float](maxlen=_RECENT), deque[int](maxlen=_RECENT)
         self._before: tuple[int, float] | None = None
 
@@ -70,24 +69,20 @@ class PointTimes:
         if not span and len(times) >= _ENOUGH:
             self._refuse("are all equal")
             return np.zeros(len(times), np.int64)
-        wrap = _WRAP if times.dtype == "u4" else np.inf
+        wrap = _WRAP if times.dtype == "u4" else 2**63
         runs = 0.5 * step_ns < moved % wrap * unit < 2 * step_ns
         return np.rint((ticks - first) * unit).astype(np.int64) + self._start_ns(first, unit, stamp_ns, wrap, runs)
 
-    def _refuse(self, fault: str) -> None:
-        self._say(fault.split(maxsplit=1)[0], f"times of points {fault}: motion during a scan is not removed")
-
-    def _say(self, kind: str, text: str) -> None:
-        if kind not in self._warned:
-            self._warned.add(kind)
-            self._warn(text)
+    def _refuse(self, fault: str, effect: str = "motion during a scan is not removed") -> None:
+        if self._warn is not None:
+            self._warn(f"times of points {fault}: {effect}")
+            self._warn = None
 
     def _unit(self, first: float, stamp_ns: int, kind: str) -> int:
         """Return the unit of the times in ns."""
-        if stamp_ns > _SINCE_EPOCH_NS:
-            of_epoch = [unit for unit in _UNITS if abs(first * unit - stamp_ns) < _CLOCKS_NS]
-            if of_epoch:
-                return of_epoch[0]
+        of_epoch = [unit for unit in _UNITS if abs(first * unit - stamp_ns) < _CLOCKS_NS < stamp_ns // 1000]
+        if of_epoch:
+            return of_epoch[0]
         longest_ns = min(LONGEST_SWEEP_NS, _PERIODS * np.median(self._periods or [LONGEST_SWEEP_NS]))
         span = np.median(self._spans or [0])
         usual = _UNITS[0 if kind == "f" else -1]
@@ -95,16 +90,14 @@ class PointTimes:
 
     def _start_ns(self, first: float, unit: int, stamp_ns: int, wrap: float, runs: bool) -> int:
         """Return the time of the first point after the stamp; `runs`: the clock of the times goes on between scans."""
-        relative = [] if runs else [0, *([wrap * unit] if wrap == _WRAP else [])]
+        relative = () if runs else (0, wrap * unit)
         for origin_ns in (*relative, stamp_ns, stamp_ns + _TAI_NS, stamp_ns - _TAI_NS):
             # floats in their own unit: nanoseconds since the epoch do not fit one
             start_ns = first * unit - origin_ns if isinstance(first, int) else (first - origin_ns / unit) * unit
             if abs(start_ns) < LONGEST_SWEEP_NS:
-                if abs(origin_ns - stamp_ns) == _TAI_NS:
-                    self._say("tai", "times of points and stamps of scans are 37 s (TAI and UTC) apart: corrected")
                 return round(start_ns)
-        away = f"{(first * unit - stamp_ns) * 1e-9:.1f} s from the stamps of the scans"
-        self._say("origin", f"times of points are {away}: the first of a scan counts as measured at its stamp")
+        away = f"are {(first * unit - stamp_ns) * 1e-9:.1f} s from the stamps of the scans"
+        self._refuse(away, "the first of a scan counts as measured at its stamp")
         return 0
 
 

@@ -64,7 +64,7 @@ class MessageRouter:
         self._synchronizer = synchronizer
         self._on_odometry = on_odometry
         self._warn = warn
-        self._warned: set[tuple[str, str]] = set()
+        self._warned = set[object]()
         self._is_raw = "rect" not in topics.left_image
         self._stereo_info = bool(topics.right_info and topics.right_image)
         self._infos: dict[str, tuple[Any, Any]] = {}
@@ -98,17 +98,18 @@ class MessageRouter:
 
     def _take_sensor(self, entry: str, message: Any) -> None:
         """Add an image or a scan; images before the first camera_info wait for it."""
-        if entry != "cloud" and self._synchronizer.awaits_camera and len(self._early) < EARLY_IMAGES:
+        awaits = self._synchronizer.awaits_camera
+        if entry != "cloud" and awaits and len(self._early) < EARLY_IMAGES:
             self._early.append((entry, message))
             return
-        early, self._early = self._early, []
+        early, self._early = ([], self._early) if awaits else (self._early, [])
         for held in early:
             self.take(getattr(self._topics, held[0]), held[1])
         if self._frames is not None and entry != "right_image":
             sensor = "lidar" if entry == "cloud" else "camera"
             self._synchronizer.use_mounting(self._frames.mounting(sensor, message.header.frame_id))
         value = decode_cloud(message, self._times) if entry == "cloud" else decode_image(message, self._grey)
-        if entry == "left_image" and value.shape[::-1] != self._size:
+        if entry == "left_image" and value.shape[::-1] not in (self._size, self._synchronizer.image_size):
             self._size = value.shape[::-1]
             self._use_infos(stamp_ns(message))
         self._synchronizer.add(_INPUTS[entry], stamp_ns(message), value)
@@ -134,9 +135,13 @@ class MessageRouter:
         if topic in self._entries:
             self._synchronizer.reject(_INPUTS[self._entries[topic]], error.kind)
             self._stereo_info &= self._entries[topic] != "right_info"  # not waited for
-        if (topic, error.kind) not in self._warned:
-            self._warned.add((topic, error.kind))
-            self._warn(f"{topic}: {error}; such messages are skipped")
+        self._say(f"{topic}: {error}; such messages are skipped", (topic, error.kind))
+
+    def _say(self, text: str, kind: object = None) -> None:
+        """Warn of the first of a kind, by default of the same text."""
+        if (kind or text) not in self._warned:
+            self._warned.add(kind or text)
+            self._warn(text)
 
     def _use_info(self, entry: str, message: Any) -> None:
         """Use the camera_info of the pair, or the left one alone when the right camera is silent.
@@ -144,14 +149,15 @@ class MessageRouter:
         The first is used at once. A later one with other contents replaces it when it comes twice in a row:
         one message may be damaged, a camera with new settings repeats them.
         """
-        content = (message.width, message.height, bytes(np.array(message.k)), bytes(np.array(message.p)))
+        content = (window_of(message), bytes(np.array(message.k)), bytes(np.array(message.p)))
         repeated, self._said[entry] = self._said.get(entry) == content, content
         known = self._infos.get(entry, (None, None))[0]
         if content != known and (known is None or repeated):
             self._synchronizer.use_window(window_of(message))
             decode_camera_info(message)
             if self._is_raw and self._frames is not None and self._frames.is_open and np.any(np.array(message.d)):
-                text = "the images are raw, with lens distortion: rectify them (image_proc), or name a calibration"
+                lens = f"lens distortion ({message.distortion_model or 'of no named model'})"
+                text = f"the images are raw, with {lens}: rectify them (image_proc), or name a calibration"
                 raise MessageError("raw", text)
             self._infos[entry] = content, message
         self._use_infos(stamp_ns(message))
@@ -165,9 +171,9 @@ class MessageRouter:
             return
         before, self._used = self._used, (left[0], right[0], self._size)
         try:
-            camera = decode_camera_info(left[1], right[1], self._size, self._warn)
+            camera = decode_camera_info(left[1], right[1], self._size, self._say)
         except MessageError as error:
-            self._warn(f"{self._topics.right_info}: {error}; the left camera is used alone")
+            self._say(f"{self._topics.right_info}: {error}; the left camera is used alone")
             camera = decode_camera_info(left[1], None, self._size)
         self._synchronizer.use_camera(camera)
         if before is not None and before[:2] != self._used[:2] and right[1] is not None:
