@@ -262,7 +262,7 @@ def _directions(cloud: Cloud) -> Mask:
 
 def _overlap(one: Mask, other: Mask) -> float:
     """Return the share of the directions of one of two messages, the narrower one, that are also the other's."""
-    return np.count_nonzero(one & other) / max(1, min(np.count_nonzero(one), np.count_nonzero(other)))
+    return int((one & other).sum()) / max(1, min(int(one.sum()), int(other.sum())))
 
 
 def _join(parts: Sequence[tuple[int, Cloud, Mask]]) -> Scan:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -95,17 +95,17 @@ class StereoRectifier:
         distortions = [np.array(camera.distortion or (0.0,) * 4) for camera in (left, right)]
         both = matrices[0], distortions[0], matrices[1], distortions[1]
         # Bouguet's method, without black borders
-        options, functions = {"flags": cv2.CALIB_ZERO_DISPARITY, "alpha": 0}, cv2
-        if left.distortion_model == "equidistant":
-            options, functions = {"flags": cv2.CALIB_ZERO_DISPARITY, "balance": 0.0}, cv2.fisheye
+        fisheye = left.distortion_model == "equidistant"
+        functions: Any = cv2.fisheye if fisheye else cv2
+        black = {"balance": 0.0} if fisheye else {"alpha": 0}
         turn, shift = right_T_left[:3, :3].copy(), right_T_left[:3, 3:].copy()  # contiguous, as fisheye wants them
-        result = functions.stereoRectify(*both, size, turn, shift, **options)
+        result = functions.stereoRectify(*both, size, turn, shift, flags=cv2.CALIB_ZERO_DISPARITY, **black)
         turns, projections = result[:2], result[2:4]
         # a fisheye's whole view is too wide for a plane: its centre keeps its resolution
-        larger = max(1.0, matrices[0][0, 0] / projections[0][0, 0]) if functions is cv2.fisheye else 1.0
+        larger = max(1.0, matrices[0][0, 0] / projections[0][0, 0]) if fisheye else 1.0
         for projection in projections:
             projection[[0, 1, 0], [0, 1, 3]] *= larger
-        self._maps = [
+        self._maps: list[Any] = [
             functions.initUndistortRectifyMap(matrix, distortion, turn, projection[:, :3], size, cv2.CV_16SC2)
             for matrix, distortion, turn, projection in zip(matrices, distortions, turns, projections, strict=True)
         ]

@@ -370,7 +370,7 @@ def decode_picture(content: bytes, grey: GreyRange | None = None) -> Image | Non
     data = np.frombuffer(content, np.uint8)
     # intrinsics hold for unrotated images
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(data, flags) if len(data) else None
+    image: Any = cv2.imdecode(data, flags) if len(data) else None
     if image is not None and image.dtype == np.uint16:
         return (grey or GreyRange()).to_bytes(image)
     return None if image is None or image.dtype != np.uint8 else image

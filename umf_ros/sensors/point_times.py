@@ -73,10 +73,11 @@ class PointTimes:
         runs = 0.5 * step_ns < moved % wrap * unit < 2 * step_ns
         return np.rint((ticks - first) * unit).astype(np.int64) + self._start_ns(first, unit, stamp_ns, wrap, runs)
 
-    def _refuse(self, fault: str, effect: str = "motion during a scan is not removed") -> None:
+    def _refuse(self, fault: str, effect: str = "motion during a scan is not removed") -> NDArray[np.int64] | None:
         if self._warn is not None:
             self._warn(f"times of points {fault}: {effect}")
             self._warn = None
+        return None
 
     def _unit(self, first: float, stamp_ns: int, kind: str) -> int:
         """Return the unit of the times in ns."""

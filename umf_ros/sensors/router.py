@@ -108,7 +108,7 @@ class MessageRouter:
         if self._frames is not None and entry != "right_image":
             sensor = "lidar" if entry == "cloud" else "camera"
             self._synchronizer.use_mounting(self._frames.mounting(sensor, message.header.frame_id))
-        value = decode_cloud(message, self._times) if entry == "cloud" else decode_image(message, self._grey)
+        value: Any = decode_cloud(message, self._times) if entry == "cloud" else decode_image(message, self._grey)
         if entry == "left_image" and value.shape[::-1] not in (self._size, self._synchronizer.image_size):
             self._size = value.shape[::-1]
             self._use_infos(stamp_ns(message))
