@@ -125,7 +125,8 @@ class StereoRectifier:
         """Return the rectified image, (H, W) uint8, of a raw one; `side` 0: left, 1: right."""
         # area averaging first: the remap below takes four pixels only and would alias
         small = cv2.resize(raw, self._size, interpolation=cv2.INTER_AREA)
-        return np.asarray(cv2.remap(small, *self._maps[side], interpolation=cv2.INTER_LINEAR), np.uint8)
+        across, down = self._maps[side]
+        return np.asarray(cv2.remap(small, across, down, interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
