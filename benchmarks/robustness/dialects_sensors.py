@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from tempfile import gettempdir
+from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 import cv2
@@ -206,19 +206,37 @@ def paired(left: dict[int, float], right: dict[int, float]) -> Change:
     return informed(alter)
 
 
+def unchanged(topic: str, message: Any) -> Iterator[tuple[int, Any]]:
+    """The message itself."""
+    yield 0, message
+
+
 def late_info(topic: str, message: Any) -> Iterator[tuple[int, Any]]:
     """camera_info that are recorded after the images of their stamp."""
     yield (30_000_000 if topic.endswith("camera_info") else 0), message
 
 
-def closures(expected: int, text: str = "") -> Check:
-    """Return a check of the true and the false closures, and of a line."""
+def _judged(outcome: Outcome) -> tuple[int, int]:
+    """Return the numbers of true and of false closures."""
+    found = re.search(r"(\d+) true and (\d+) false", " ".join(outcome.lines))
+    return (int(found[1]), int(found[2])) if found else (-1, -1)
+
+
+@cache
+def plain() -> int:
+    """True closures of the drive as it is."""
+    with TemporaryDirectory() as folder:
+        case = Case("plain", partial(rewrite, unchanged), REPLAY, "", lambda outcome: (True, str(_judged(outcome)[0])))
+        return int(case.run(Path(folder))[1])
+
+
+def closures(text: str = "") -> Check:
+    """Return a check of the true closures, of which a tenth may lie at the limit, the false ones, and of a line."""
 
     def check(outcome: Outcome) -> tuple[bool, str]:
-        found = re.search(r"(\d+) true and (\d+) false", " ".join(outcome.lines))
-        true, false = (int(one) for one in found.groups()) if found else (-1, -1)
+        (true, false), expected = _judged(outcome), plain()
         told, line = says(text)(outcome) if text else (True, "")
-        return true >= expected and false == 0 and told, f"{true} true, {false} false closures; {line}"
+        return true >= 0.9 * expected > 0 == false and told, f"{true} of {expected}, {false} false; {line}"
 
     return check
 
@@ -228,7 +246,7 @@ REPLAY = ("replay", "drive.mcap", "--out", "runs")
 
 def _case(name: str, change: Change, text: str = "") -> Case:
     expected = "all closures, none false" + (f"; a line: {text}" if text else "")
-    return Case(name, partial(rewrite, change), REPLAY, expected, closures(CLOSURES, text))
+    return Case(name, partial(rewrite, change), REPLAY, expected, closures(text))
 
 
 def _times(name: str, field: str, kind: str, times: Callable[[np.ndarray, int], Any], text: str = "") -> Case:
@@ -273,11 +291,9 @@ def _below_a_pixel(outcome: Outcome) -> tuple[bool, str]:
     return float(outcome.said.split()[0]) < 1, outcome.said
 
 
-CLOSURES = 1
-"""True ones of the drive as it is, but for those that lie at the limit."""
 ALONE = "the left camera is used alone"
 CASES: list[Case] = [
-    _case("19 plain", lambda topic, message: iter([(0, message)])),
+    _case("19 plain", unchanged),
     _case("19 late camera_info", late_info),
     _times("us_epoch", "timestamp", "<f8", lambda offsets, stamp: (stamp + offsets) * 1e-3),
     _times("ms_epoch", "timestamp", "<f8", lambda offsets, stamp: (stamp + offsets) * 1e-6),
