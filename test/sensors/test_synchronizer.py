@@ -332,7 +332,7 @@ def test_parts_of_a_scan_are_joined(
     ]
     frames = feed(synchronizer, stream) + synchronizer.flush()
     whole = [frame for frame in frames if frame.points is not None and len(frame.points) == 4000]
-    assert len(whole) >= 12 - 1 - 5 // count and len(frames) - len(whole) <= 6
+    assert len(whole) >= 12 - 2 - 6 // count and len(frames) - len(whole) <= 8
     if every_ms > 100:  # after a pause a scan begins
         starts = {scan * every_ms * MS for scan in range(12)}
         assert {frame.stamp_ns - OFFSET - T0 for frame in whole} <= starts
@@ -375,7 +375,7 @@ def test_packets_of_the_whole_view_are_joined_by_time(calibration: Calibration, 
         feed_one = synchronizer.add("cloud", T0 + at * 10 * MS, part)
         assert feed_one is None
     frames = synchronizer.pop() + synchronizer.flush()
-    counts = [len(frame.points) for frame in frames[5:] if frame.points is not None]
+    counts = [len(frame.points) for frame in frames[6:] if frame.points is not None]
     assert counts[:-1] == [4000] * (len(counts) - 1) and len(counts) >= 9
     check_accounts(synchronizer)
 

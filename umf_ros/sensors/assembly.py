@@ -7,6 +7,7 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -184,10 +185,10 @@ class ScanLimits:
             self._warn(text)
 
 
-FEW, DECIDING = 100, 4
-"""Returns of a message by which it can be recognised as a part, and pairs of messages that decide (*by hand*)."""
-SAME, SECTORS = 0.5, 0.3
-"""Overlap of directions above which messages see the same, and below which fast ones are sectors (*by hand*)."""
+FEW, DECIDING = 100, 6
+"""Returns of a message by which it can be recognised as a part, and messages that decide (*by hand*)."""
+APART, ANEW = 0.3, 0.6
+"""Overlap of directions below which two messages are parts, and about which one begins a scan (*by hand*)."""
 FASTEST_NS, PACKETS_NS, GAP = 20_000_000, 100_000_000, 3
 """Shortest period of whole scans, length of a scan of packets, and longest gap in a scan in periods (*by hand*)."""
 
@@ -230,16 +231,15 @@ class ScanJoiner:
         return [_join(parts)] if parts else []
 
     def _decide(self) -> None:
-        """Decide by the messages so far, if they suffice; they were used one by one."""
-        if len(self._parts) < 2:
+        """Decide by the first messages, which were used one by one."""
+        if len(self._parts) < DECIDING:
             return
-        self._period_ns = int(np.median(np.diff([stamp_ns for stamp_ns, *_ in self._parts])))
-        fast = self._period_ns < FASTEST_NS
-        apart = _overlap(self._parts[-1][2], self._parts[-2][2]) < (SECTORS if fast else SAME)
-        if not fast and not apart:
-            self._kind, self._parts = "whole", []
-        elif len(self._parts) > DECIDING:
-            self._kind, self._parts = "parts" if apart else "packets", []
+        stamps, _, seen = zip(*self._parts, strict=True)
+        self._period_ns, self._parts = int(np.median(np.diff(stamps))), []
+        if min(_overlap(one, other) for one, other in combinations(seen, 2)) < APART:
+            self._kind = "parts"
+        else:
+            self._kind = "packets" if self._period_ns < FASTEST_NS else "whole"
 
     def _begins(self, stamp_ns: int, seen: Mask) -> bool:
         """Return whether a message begins a new scan."""
@@ -248,7 +248,9 @@ class ScanJoiner:
             return True
         if stamp_ns - self._parts[0][0] > longest_ns - self._period_ns // 2:
             return True
-        return self._kind == "parts" and _overlap(seen, np.logical_or.reduce([one for *_, one in self._parts])) > SAME
+        # seen before, but not just before
+        before = np.logical_or.reduce([one for *_, one in self._parts])
+        return self._kind == "parts" and _overlap(seen, self._parts[-1][2]) < ANEW < _overlap(seen, before)
 
 
 def _directions(cloud: Cloud) -> Mask:
