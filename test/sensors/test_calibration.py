@@ -200,3 +200,24 @@ def test_a_rectified_file_of_the_full_sensor_fits_its_binned_images(tmp_path: Pa
     assert (half.camera.fx, half.camera.baseline) == (full.camera.fx / 2, full.camera.baseline)
     assert full.within(window, (width, height)) is full
     assert full.within(window._replace(sensor=(1, 1)), (width // 2, height // 2)) is full
+
+
+@pytest.mark.parametrize(
+    ("lens", "text"),
+    [
+        ({"distortion": [0.1] * 6}, "radtan: expected one of 0, 4, 5, 8, 12, 14 coefficients"),
+        ({"distortion": [0.1] * 5, "distortion_model": "equidistant"}, "equidistant: expected one of 0, 4"),
+        ({"distortion": [0.1] * 4, "distortion_model": "fov"}, "'radtan' or 'equidistant'"),
+        ({"distortion": [0.0] * 4, "distortion_model": "equidistant"}, "both cameras need the same distortion_model"),
+    ],
+)
+def test_lenses_that_are_none_are_named(lens: dict[str, object], text: str, tmp_path: Path) -> None:
+    camera = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0}
+    still = {"translation": [0.2, 0.0, 0.0], "quaternion": [0.0, 0.0, 0.0, 1.0]}
+    pair = {"left": camera | lens, "right": camera | {"distortion": [0.0] * 4}, "left_T_right": still}
+    content = {"raw_camera": pair | {"width": 64, "height": 48}, "lidar_time_offset_s": 0.0}
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(content | {f"body_T_{one}": still for one in ("camera", "lidar", "imu")}))
+    with pytest.raises(CalibrationError, match=text) as caught:
+        load_calibration(path)
+    assert "\n" not in str(caught.value)

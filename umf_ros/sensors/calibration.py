@@ -37,6 +37,12 @@ class SensorWindow(NamedTuple):
         """Width and height of the image."""
         return self.part[0] // self.binning[0], self.part[1] // self.binning[1]
 
+    def intrinsics(self, full: Pinhole | StereoCamera) -> dict[str, Any]:
+        """Return the intrinsics of the image by those of the full sensor; pixel (0, 0) is a pixel's centre."""
+        (x, y), (across, down), (width, height) = self.offset, self.binning, self.size
+        centre = {"cx": (full.cx - x + 0.5) / across - 0.5, "cy": (full.cy - y + 0.5) / down - 0.5}
+        return {"width": width, "height": height, "fx": full.fx / across, "fy": full.fy / down, **centre}
+
 
 class Pinhole(Group):
     """Intrinsics in pixels."""
@@ -66,13 +72,6 @@ class RawCamera(Pinhole):
             raise ValueError(f"{self.distortion_model}: expected one of {expected} coefficients, in OpenCV's order")
         return self
 
-    def within(self, window: SensorWindow) -> RawCamera:
-        """Return the camera of images that show a window of this one."""
-        (x, y), (across, down), (width, height) = window.offset, window.binning, window.size
-        values = {"width": width, "height": height, "fx": self.fx / across, "fy": self.fy / down}
-        centre = {"cx": (self.cx - x + 0.5) / across - 0.5, "cy": (self.cy - y + 0.5) / down - 0.5}
-        return self.model_copy(update=values | centre)
-
     def matrix(self, size: tuple[int, int]) -> Array:
         """Return (3, 3) intrinsics of the image scaled to `size`; pixel (0, 0) is a pixel's centre."""
         sx, sy = size[0] / self.width, size[1] / self.height
@@ -88,8 +87,10 @@ class StereoRectifier:
 
     def __init__(self, left: RawCamera, right: RawCamera, left_T_right: Array, size: tuple[int, int]) -> None:
         """Prepare the maps; `size` is the width and height of the result."""
+        if left.distortion_model != right.distortion_model:
+            raise ValueError("both cameras need the same distortion_model")
         self.raw_size = (left.width, left.height)
-        self._size, self._pair = size, (left, right, left_T_right)
+        self._size, self._pair, self._left_T_right = size, (left, right), left_T_right
         right_T_left = invert(left_T_right)
         matrices = [camera.matrix(size) for camera in (left, right)]
         distortions = [np.array(camera.distortion or (0.0,) * 4) for camera in (left, right)]
@@ -116,10 +117,10 @@ class StereoRectifier:
 
     def within(self, window: SensorWindow) -> StereoRectifier:
         """Return the rectification of raw images that show a window of these."""
-        left, right, left_T_right = self._pair
+        left, right = (camera.model_copy(update=window.intrinsics(camera)) for camera in self._pair)
         (width, height), (across, down) = window.size, (self.raw_size[i] / self._size[i] for i in (0, 1))
         size = min(width, round(window.part[0] / across)), min(height, round(window.part[1] / down))
-        return StereoRectifier(left.within(window), right.within(window), left_T_right, size)
+        return StereoRectifier(left, right, self._left_T_right, size)
 
     def apply(self, raw: Image, side: int) -> Image:
         """Return the rectified image, (H, W) uint8, of a raw one; `side` 0: left, 1: right."""
@@ -169,11 +170,7 @@ class Calibration:
         if self.rectifier is not None:
             rectifier = self.rectifier.within(window)
             return replace(self, rectifier=rectifier, camera=rectifier.camera)
-        one = self.camera
-        part = RawCamera(**{name: getattr(one, name) for name in Pinhole.model_fields}, distortion=()).within(window)
-        return replace(
-            self, camera=StereoCamera(part.width, part.height, part.fx, part.fy, part.cx, part.cy, one.baseline)
-        )
+        return replace(self, camera=replace(self.camera, **window.intrinsics(self.camera)))
 
     def with_camera(self, camera: StereoCamera) -> Calibration:
         """Return this calibration with the intrinsics of a camera_info; a baseline of 0 keeps the one known here."""
@@ -247,12 +244,6 @@ class _RawPair(Group):
     left_T_right: _Pose
     width: int = Field(gt=0, le=LARGEST_IMAGE)
     height: int = Field(gt=0, le=LARGEST_IMAGE)
-
-    @model_validator(mode="after")
-    def _of_one_model(self) -> _RawPair:
-        if self.left.distortion_model != self.right.distortion_model:
-            raise ValueError("both cameras need the same distortion_model")
-        return self
 
 
 class _File(Group):

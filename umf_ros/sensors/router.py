@@ -109,7 +109,7 @@ class MessageRouter:
             sensor = "lidar" if entry == "cloud" else "camera"
             self._synchronizer.use_mounting(self._frames.mounting(sensor, message.header.frame_id))
         value: Any = decode_cloud(message, self._times) if entry == "cloud" else decode_image(message, self._grey)
-        if entry == "left_image" and value.shape[::-1] not in (self._size, self._synchronizer.image_size):
+        if entry == "left_image" and value.shape[::-1] != self._size:
             self._size = value.shape[::-1]
             self._use_infos(stamp_ns(message))
         self._synchronizer.add(_INPUTS[entry], stamp_ns(message), value)

@@ -149,14 +149,9 @@ class Synchronizer:
         self._window = window
 
     @property
-    def image_size(self) -> tuple[int, int]:
-        """Width and height of the images that can be used; 0 while nothing is known."""
-        return self._calibration.image_size
-
-    @property
     def awaits_camera(self) -> bool:
         """Whether the first camera_info has to come before images can be used."""
-        return not self.image_size[0] and self._awaits("camera_info")
+        return not self._calibration.image_size[0] and self._awaits("camera_info")
 
     def use_mounting(self, poses: dict[str, Any]) -> None:
         """Replace poses of the sensors, `body_T_camera` or `body_T_lidar` by name."""
