@@ -188,8 +188,8 @@ def measure(seed: int, noise: bool) -> dict[str, Any]:
 
 def write_diagonal(length_m: float, sent: Any) -> None:
     """Grid and files of a straight path, in a process of its own, whose peak is theirs."""
-    steps = np.arange(0.0, length_m, SETTINGS.cell_m, np.float32)
-    aside = np.arange(-REACH_M, REACH_M, SETTINGS.cell_m, np.float32)
+    steps = np.arange(0.0, length_m, SETTINGS.cell_m, dtype=np.float32)
+    aside = np.arange(-REACH_M, REACH_M, SETTINGS.cell_m, dtype=np.float32)
     points = np.empty((len(steps) * len(aside), 3), np.float32)
     for row, along in enumerate(steps):
         part = points[row * len(aside) : (row + 1) * len(aside)]

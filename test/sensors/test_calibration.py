@@ -10,7 +10,7 @@ from recordings import CALIBRATION, camera_info
 
 from umf_ros.core.errors import CalibrationError
 from umf_ros.core.geometry import make_pose, transform
-from umf_ros.sensors.calibration import RawCamera, StereoRectifier, load_calibration
+from umf_ros.sensors.calibration import RawCamera, SensorWindow, StereoRectifier, load_calibration
 from umf_ros.sensors.decode import decode_camera_info
 
 DATASETS = ("simulated", "s3li-etna", "s3li-vulcano")
@@ -125,7 +125,8 @@ def blob(camera: RawCamera, point: np.ndarray, camera_T_left: np.ndarray) -> np.
     rotation, _ = cv2.Rodrigues(camera_T_left[:3, :3])
     distortion = np.array(camera.distortion)
     matrix = camera.matrix((camera.width, camera.height))
-    pixel, _ = cv2.projectPoints(point[None], rotation, camera_T_left[:3, 3], matrix, distortion)
+    seen_by = cv2.fisheye if camera.distortion_model == "equidistant" else cv2
+    pixel, _ = seen_by.projectPoints(point[None, None], rotation, camera_T_left[:3, 3], matrix, distortion)
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     away = (u - pixel[0, 0, 0]) ** 2 + (v - pixel[0, 0, 1]) ** 2
     return (250 * np.exp(-away / 72)).astype(np.uint8)
@@ -137,19 +138,86 @@ def centre(image: np.ndarray) -> np.ndarray:
     return np.array([u @ weight, v @ weight]) / weight.sum()
 
 
-def test_rectified_pair_sees_points_where_an_ideal_pair_would() -> None:
-    lens = (-0.2, 0.08, 0.001, -0.0005)
-    left = RawCamera(width=1032, height=772, fx=870.0, fy=868.0, cx=520.0, cy=380.0, distortion=lens)
-    right = RawCamera(width=1032, height=772, fx=865.0, fy=866.0, cx=512.0, cy=390.0, distortion=lens)
+LENSES = {
+    "radtan": (-0.2, 0.08, 0.001, -0.0005),
+    "rational": (-0.2, 0.08, 0.001, -0.0005, 0.01, 0.02, -0.01, 0.005),
+    "thin prism": (-0.2, 0.08, 0.001, -0.0005, 0.01, 0.02, -0.01, 0.005, 0.002, -0.001, 0.001, 0.002),
+    "equidistant": (0.0035, 0.0007, -0.002, 0.0002),
+}
+HALVES = SensorWindow((1032, 772), (0, 0), (1032, 772), (2, 2))
+CUT = SensorWindow((1032, 772), (100, 60), (860, 640), (1, 1))
+CUT_HALVES = SensorWindow((1032, 772), (100, 60), (860, 640), (2, 2))
+
+
+@pytest.mark.parametrize("window", [None, HALVES, CUT, CUT_HALVES])
+@pytest.mark.parametrize("lens", LENSES)
+def test_rectified_pair_sees_points_where_an_ideal_pair_would(lens: str, window: SensorWindow | None) -> None:
+    """Also in raw images that show a window of the calibrated sensor, each pixel the mean of those it holds."""
+    model = "equidistant" if lens == "equidistant" else "radtan"
+    common = {"width": 1032, "height": 772, "distortion": LENSES[lens], "distortion_model": model}
+    left = RawCamera(fx=870.0, fy=868.0, cx=520.0, cy=380.0, **common)
+    right = RawCamera(fx=865.0, fy=866.0, cx=512.0, cy=390.0, **common)
     turn, _ = cv2.Rodrigues(np.array([0.01, -0.015, 0.02]))
     left_T_right = make_pose(turn, [0.2, 0.003, -0.002])
     rectifier = StereoRectifier(left, right, left_T_right, size=(344, 256))
+    if window is not None:
+        rectifier = rectifier.within(window)
+        assert rectifier.raw_size == window.size
     camera, rectified_T_left = rectifier.camera, np.linalg.inv(rectifier.raw_T_rectified)
     assert camera.baseline == pytest.approx(np.linalg.norm(left_T_right[:3, 3]), rel=1e-6)
+
+    def shown(raw: np.ndarray) -> np.ndarray:
+        if window is None:
+            return raw
+        (x, y), (width, height) = window.offset, window.part
+        part = raw[y : y + height, x : x + width]
+        return cv2.resize(part, window.size, interpolation=cv2.INTER_AREA)
+
     for point in np.array([[0.3, -0.2, 4.0], [-1.0, 0.8, 6.0], [1.5, 0.9, 9.0]]):
-        seen_left = centre(rectifier.apply(blob(left, point, np.eye(4)), 0))
-        seen_right = centre(rectifier.apply(blob(right, point, np.linalg.inv(left_T_right)), 1))
+        seen_left = centre(rectifier.apply(shown(blob(left, point, np.eye(4))), 0))
+        seen_right = centre(rectifier.apply(shown(blob(right, point, np.linalg.inv(left_T_right))), 1))
         x, y, z = transform(rectified_T_left, point[None])[0]
         assert np.allclose(seen_left, [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], atol=0.15)
         assert seen_left[1] - seen_right[1] == pytest.approx(0, abs=0.15)
         assert seen_left[0] - seen_right[0] == pytest.approx(camera.fx * camera.baseline / z, abs=0.15)
+
+
+def test_the_centre_of_a_fisheye_keeps_its_resolution() -> None:
+    one = RawCamera(
+        **dict(zip(("fx", "fy", "cx", "cy"), (191.0, 191.0, 255.0, 257.0), strict=True)),
+        **{"width": 512, "height": 512, "distortion": LENSES["equidistant"], "distortion_model": "equidistant"},
+    )
+    rectifier = StereoRectifier(one, one, make_pose(np.eye(3), [0.1, 0, 0]), size=(512, 512))
+    assert rectifier.camera.fx == pytest.approx(191, rel=0.01) and rectifier.camera.baseline == pytest.approx(0.1)
+
+
+def test_a_rectified_file_of_the_full_sensor_fits_its_binned_images(tmp_path: Path) -> None:
+    full = load_calibration("simulated")
+    width, height = full.image_size
+    window = SensorWindow((width, height), (0, 0), (width, height), (2, 2))
+    half = full.within(window, (width // 2, height // 2))
+    assert half.image_size == (width // 2, height // 2)
+    assert (half.camera.fx, half.camera.baseline) == (full.camera.fx / 2, full.camera.baseline)
+    assert full.within(window, (width, height)) is full
+    assert full.within(window._replace(sensor=(1, 1)), (width // 2, height // 2)) is full
+
+
+@pytest.mark.parametrize(
+    ("lens", "text"),
+    [
+        ({"distortion": [0.1] * 6}, "radtan: expected one of 0, 4, 5, 8, 12, 14 coefficients"),
+        ({"distortion": [0.1] * 5, "distortion_model": "equidistant"}, "equidistant: expected one of 0, 4"),
+        ({"distortion": [0.1] * 4, "distortion_model": "fov"}, "'radtan' or 'equidistant'"),
+        ({"distortion": [0.0] * 4, "distortion_model": "equidistant"}, "both cameras need the same distortion_model"),
+    ],
+)
+def test_lenses_that_are_none_are_named(lens: dict[str, object], text: str, tmp_path: Path) -> None:
+    camera = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0}
+    still = {"translation": [0.2, 0.0, 0.0], "quaternion": [0.0, 0.0, 0.0, 1.0]}
+    pair = {"left": camera | lens, "right": camera | {"distortion": [0.0] * 4}, "left_T_right": still}
+    content = {"raw_camera": pair | {"width": 64, "height": 48}, "lidar_time_offset_s": 0.0}
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(content | {f"body_T_{one}": still for one in ("camera", "lidar", "imu")}))
+    with pytest.raises(CalibrationError, match=text) as caught:
+        load_calibration(path)
+    assert "\n" not in str(caught.value)

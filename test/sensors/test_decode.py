@@ -3,12 +3,14 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
-from recordings import POINT, START_NS, camera_info, cloud, drive, image, odometry, scan
+from recordings import POINT, START_NS, camera_info, cloud, drive, image, make, odometry, scan
 
 from umf_ros.core.errors import MessageError
 from umf_ros.sensors.decode import (
+    GreyRange,
     decode_camera_info,
     decode_cloud,
     decode_image,
@@ -58,9 +60,48 @@ def test_mono16_keeps_the_upper_byte(order: str, is_bigendian: int) -> None:
     assert decode_image(image(0, pixels, "mono16", is_bigendian=is_bigendian)).tolist() == [[0, 0, 1, 255]]
 
 
-@pytest.mark.parametrize(("encoding", "channel"), [("rgb8", 0), ("bgr8", 2), ("rgba8", 0), ("bgra8", 2)])
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_bits_of_16_are_those_that_the_images_use(bits: int, rng: np.random.Generator) -> None:
+    """And the same for all images: neither a dark one nor a hot pixel changes the brightness."""
+    grey, full = GreyRange(), rng.integers(0, 2**bits, (48, 64)).astype("<u2")
+    expected = full >> (bits - 8)
+    assert (decode_image(image(0, full, "mono16"), grey) == expected).all()
+    dark, hot = full // 8, np.where(np.arange(64) + np.arange(48)[:, None] == 5, 65535, full).astype("<u2")
+    assert (decode_image(image(0, dark, "16UC1"), grey) == dark >> (bits - 8)).all()
+    png = cv2.imencode(".png", full)[1].tobytes()
+    assert (decode_image(SimpleNamespace(format="mono16; png compressed", data=png), grey) == expected).all()
+    hot[1:] = full[1:]
+    assert (decode_image(image(0, hot, "mono16"), grey)[1:] == expected[1:]).all()
+
+
+def test_a_thermal_image_far_from_zero_has_contrast(rng: np.random.Generator) -> None:
+    counts = rng.integers(29_000, 31_000, (48, 64)).astype("<u2")
+    grey = GreyRange()
+    first = decode_image(image(0, counts, "mono16"), grey)
+    assert np.ptp(first) > 100 and 100 < first.mean() < 155
+    assert (decode_image(image(0, counts, "mono16"), grey) == first).all()
+
+
+def test_black_images_of_16_bits_are_black() -> None:
+    assert not decode_image(image(0, np.zeros((4, 4), "<u2"), "mono16")).any()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "channel"),
+    [("rgb16", 0), ("bgr16", 2), ("rgba16", 0), ("bgra16", 2), ("16UC3", 2), ("16UC4", 2)],
+)
+def test_colours_of_16_bits(encoding: str, channel: int) -> None:
+    pixels = np.zeros((4, 6, 4 if encoding in ("rgba16", "bgra16", "16UC4") else 3), "<u2")
+    pixels[..., channel] = 4000
+    grey = decode_image(image(0, pixels, encoding, width=6))
+    assert np.abs(grey.astype(int) - 0.299 * 250).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("encoding", "channel"), [("8UC3", 2), ("8UC4", 2), ("rgb8", 0), ("bgr8", 2), ("rgba8", 0), ("bgra8", 2)]
+)
 def test_red_weighs_the_same_in_every_colour_order(encoding: str, channel: int) -> None:
-    pixels = np.zeros((4, 6, 4 if "a" in encoding else 3), np.uint8)
+    pixels = np.zeros((4, 6, 4 if "a" in encoding or "4" in encoding else 3), np.uint8)
     pixels[..., channel] = 200
     grey = decode_image(image(0, pixels, encoding, width=6))
     assert grey.shape == (4, 6)
@@ -71,8 +112,9 @@ def test_red_weighs_the_same_in_every_colour_order(encoding: str, channel: int) 
 @pytest.mark.parametrize(("colour", "weight"), [("r", 0.299), ("g", 0.587), ("b", 0.114)])
 def test_bayer_patterns_start_at_the_upper_left(pattern: str, colour: str, weight: float) -> None:
     tile = np.array([200 if cell == colour else 0 for cell in pattern], np.uint8).reshape(2, 2)
-    grey = decode_image(image(0, np.tile(tile, (10, 10)), f"bayer_{pattern}8"))
-    assert np.abs(grey[4:-4, 4:-4].astype(int) - weight * 200).max() <= 2
+    for mosaic, bits in ((tile, 8), (tile.astype("<u2") * 16, 16)):  # 200, and 3200 of 4095
+        grey = decode_image(image(0, np.tile(mosaic, (10, 10)), f"bayer_{pattern}{bits}"))
+        assert np.abs(grey[4:-4, 4:-4].astype(int) - weight * 200).max() <= 2
 
 
 @pytest.mark.parametrize(
@@ -131,7 +173,7 @@ def test_a_real_return_one_metre_away_stays() -> None:
 def test_a_return_of_livox_one_metre_away_stays() -> None:
     rows = [(0.0, 1.0, 0.0, 50, 7), (0.0, 0.0, 0.0, 0, 8), (2.0, 0.0, 0.0, 0, 9)]
     points = [SimpleNamespace(x=x, y=y, z=z, reflectivity=r, offset_time=t) for x, y, z, r, t in rows]
-    decoded = decode_cloud(SimpleNamespace(points=points))
+    decoded = decode_cloud(SimpleNamespace(header=cloud(0, scan(POINTS)).header, points=points))
     assert decoded.points.tolist() == [[0, 1, 0], [2, 0, 0]]
     assert decoded.intensity is not None and decoded.intensity.tolist() == [50, 0]
     assert decoded.time_offset_ns is not None and decoded.time_offset_ns.tolist() == [7, 9]
@@ -231,10 +273,80 @@ def test_uncalibrated_camera_info_is_refused(changes: dict[str, Any]) -> None:
     assert kind_of(decode_camera_info, camera_info(0, 579.5, (688, 512), **changes)) == "camera_info"
 
 
-@pytest.mark.parametrize("baseline", [0.0, -0.2])
-def test_pair_without_a_baseline_is_refused(baseline: float) -> None:
-    left, right = camera_info(0, 579.5, (688, 512)), camera_info(0, 579.5, (688, 512), baseline=baseline)
-    assert kind_of(decode_camera_info, left, right) == "camera_info"
+def window(offset: tuple[int, int] = (0, 0), part: tuple[int, int] = (0, 0), binning: int = 0) -> dict[str, Any]:
+    region = {"x_offset": offset[0], "y_offset": offset[1], "width": part[0], "height": part[1], "do_rectify": True}
+    return {"binning_x": binning, "binning_y": binning, "roi": make("sensor_msgs/msg/RegionOfInterest", **region)}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "focal", "centre", "changes", "size", "expected"),
+    [
+        ((1376, 1024), 1159.0, (688.0, 512.0), window(binning=2), None, (688, 512, 579.5, 344, 256)),
+        (
+            (1376, 1024),
+            579.5,
+            (344.0, 256.0),
+            window(binning=2),
+            None,
+            (688, 512, 579.5, 344, 256),
+        ),  # the Mako's driver
+        ((788, 572), 579.5, (384.0, 286.0), window((40, 30), (688, 512)), None, (688, 512, 579.5, 344, 256)),
+        ((788, 572), 579.5, (384.0, 286.0), window((40, 30), (688, 512), 1), None, (688, 512, 579.5, 344, 256)),
+        ((1576, 1144), 1159.0, (768.0, 572.0), window((80, 60), (1376, 1024), 2), None, (688, 512, 579.5, 344, 256)),
+        ((688, 512), 579.5, (344.0, 256.0), window(part=(688, 512)), None, (688, 512, 579.5, 344, 256)),
+        ((688, 512), 579.5, (344.0, 256.0), window((0, 256), (688, 256)), None, (688, 256, 579.5, 344, 0)),
+        # flags of another mode than the images'
+        ((688, 512), 579.5, (344.0, 256.0), window(binning=2), (688, 512), (688, 512, 579.5, 344, 256)),
+    ],
+)
+def test_binning_and_region_are_those_of_rep_104(
+    sensor: Any, focal: float, centre: Any, changes: Any, size: Any, expected: Any
+) -> None:
+    k = np.array([focal, 0, centre[0], 0, focal, centre[1], 0, 0, 1])
+    p = np.insert(k.astype(float), [3, 6, 9], 0)
+    right = p.copy()
+    right[3] = -focal * 0.2
+    infos = [camera_info(0, focal, sensor, **{"k": k, "p": one, **changes}) for one in (p, right)]
+    camera = decode_camera_info(*infos, size)
+    assert (camera.width, camera.height, camera.fx, camera.cx, camera.cy) == pytest.approx(expected)
+    assert camera.fy == camera.fx and camera.baseline == pytest.approx(0.2)
+
+
+def with_p(stereo: float, **places: float) -> Any:
+    info = camera_info(0, 579.5, (688, 512), baseline=stereo)
+    for place, value in places.items():
+        info.p[int(place[1:])] = value
+    return info
+
+
+@pytest.mark.parametrize(
+    ("right", "text"),
+    [
+        ({"stereo": 0.0}, "baseline of -?0 m"),
+        ({"stereo": -0.2}, "baseline of -0.2 m, by its P.3. of 115.9"),
+        ({"stereo": 0.2, "p3": -0.2}, "baseline of 0.0003451 m, by its P.3. of -0.2, which is -fx . metres"),
+        ({"stereo": 0.2, "p0": 583.2}, "not of one rectified pair: fx 579.5, .* and fx 583.2"),
+        ({"stereo": 0.2, "p2": 318.0}, "not of one rectified pair: .*cx 318.0"),
+    ],
+)
+def test_pair_without_a_baseline_is_refused(right: dict[str, float], text: str) -> None:
+    with pytest.raises(MessageError, match=text) as caught:
+        decode_camera_info(camera_info(0, 579.5, (688, 512)), with_p(**right))
+    assert caught.value.kind == "camera_info" and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "text"),
+    [
+        ({"stereo": -0.2}, {"stereo": 0.0}, ""),  # the right camera is the origin
+        ({"stereo": 0.2}, {"stereo": 0.2}, "0.2 m is taken as the baseline"),  # Gazebo
+        ({"stereo": 0.0, "p1": -52.4}, {"stereo": 0.2, "p1": -52.4}, "not that of a rectified camera: P[1] is -52.4"),
+    ],
+)
+def test_unusual_pairs_are_used_and_told(left: dict[str, float], right: dict[str, float], text: str) -> None:
+    told: list[str] = []
+    assert decode_camera_info(with_p(**left), with_p(**right), None, told.append).baseline == pytest.approx(0.2)
+    assert len(told) == bool(text) and all(text in line for line in told)
 
 
 def test_messages_of_rclpy_are_the_same(rng: np.random.Generator) -> None:

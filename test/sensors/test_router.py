@@ -2,15 +2,30 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from recordings import CALIBRATION, CLOUD, LEFT, LEFT_INFO, START_NS, camera_info, cloud, image, odometry, scan
+from recordings import (
+    CALIBRATION,
+    CLOUD,
+    LEFT,
+    LEFT_INFO,
+    RIGHT,
+    START_NS,
+    camera_info,
+    cloud,
+    image,
+    odometry,
+    scan,
+)
 
-from umf_ros.core.config import Sync, Topics
-from umf_ros.sensors.calibration import load_calibration
-from umf_ros.sensors.router import MessageRouter, wanted_inputs
+from umf_ros.core.config import TRANSFORMS, Settings, Sync, Topics
+from umf_ros.sensors.calibration import calibration_of, load_calibration
+from umf_ros.sensors.router import EARLY_IMAGES, MessageRouter, wanted_inputs
 from umf_ros.sensors.synchronizer import Synchronizer
+
+RIGHT_INFO = Topics().right_info
 
 
 @pytest.fixture
@@ -84,6 +99,80 @@ def test_useless_camera_info_is_told_and_the_calibration_file_stands(synchronize
     (frame,) = synchronizer.pop()
     assert frame.camera.fx == 60
     assert len(told) == 1 and "not calibrated" in told[0]
+
+
+def open_rig(**sync: float) -> Synchronizer:
+    """A synchronizer that knows the rig from messages only."""
+    return Synchronizer(Sync(**sync), calibration_of(Settings(calibration=TRANSFORMS)), wanted_inputs(Topics()))
+
+
+def test_images_wait_for_their_first_camera_info() -> None:
+    told: list[str] = []
+    synchronizer = open_rig()
+    intake = MessageRouter(synchronizer, Topics(), told.append)
+    pixels = np.zeros((48, 64), np.uint8)
+    for at in (0, 1, 2):
+        stamp = START_NS + at * 100_000_000
+        intake.take(LEFT, image(stamp, pixels))
+        intake.take(RIGHT, image(stamp, pixels))
+        intake.take(CLOUD, cloud(stamp, scan(np.full((3, 3), 4.0))))
+        if at == 1:
+            intake.take(LEFT_INFO, camera_info(stamp, 77.0, (64, 48)))
+            intake.take(RIGHT_INFO, camera_info(stamp, 77.0, (64, 48), baseline=0.2))
+    frames = synchronizer.flush()
+    assert [(frame.camera.fx, frame.left is not None, frame.right is not None) for frame in frames] == [
+        (77, True, True)
+    ] * 3
+    assert not told and not synchronizer.counters["left"].dropped.total()
+
+
+def test_images_do_not_wait_forever_for_a_camera_info() -> None:
+    told: list[str] = []
+    synchronizer = open_rig()
+    intake = MessageRouter(synchronizer, Topics(right_image="", right_info=""), told.append)
+    for at in range(EARLY_IMAGES + 3):
+        intake.take(LEFT, image(START_NS + at * 100_000_000, np.zeros((48, 64), np.uint8)))
+    assert len(told) == 1 and "image before its camera_info" in told[0]
+    intake.take(LEFT_INFO, camera_info(START_NS, 0.0, (64, 48), k=np.zeros(9), p=np.zeros(12)))
+    intake.take(LEFT, image(START_NS + at * 10**9, np.zeros((48, 64), np.uint8)))
+    assert synchronizer.counters["left"].dropped == {"camera_info": EARLY_IMAGES + 4}
+
+
+@pytest.mark.parametrize("changes", [{"baseline": 0.0}, {"k": np.zeros(9), "p": np.zeros(12)}])
+def test_a_right_camera_info_without_use_leaves_the_left_camera(changes: dict[str, Any]) -> None:
+    told: list[str] = []
+    synchronizer = open_rig()
+    intake = MessageRouter(synchronizer, Topics(), told.append)
+    intake.take(RIGHT_INFO, camera_info(START_NS, 77.0, (64, 48), **changes))
+    intake.take(LEFT_INFO, camera_info(START_NS, 77.0, (64, 48)))
+    intake.take(CLOUD, cloud(START_NS, scan(np.full((3, 3), 4.0))))
+    intake.take(LEFT, image(START_NS, np.zeros((48, 64), np.uint8)))
+    (frame,) = synchronizer.flush()
+    assert frame.left is not None and (frame.camera.fx, frame.camera.baseline) == (77, 0)
+    assert len(told) == 1 and told[0].startswith(RIGHT_INFO)
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_binned_images_of_a_calibrated_sensor(synchronizer: Synchronizer, calibrated: bool) -> None:
+    """Also of a driver that knows the binning but no intrinsics: the file's are those of the full sensor."""
+    told: list[str] = []
+    intake = MessageRouter(synchronizer, Topics(right_image="", right_info="", odometry=""), told.append)
+    blank = {} if calibrated else {"k": np.zeros(9), "p": np.zeros(12)}
+    intake.take(LEFT_INFO, camera_info(START_NS, 60.0, (64, 48), binning_x=2, binning_y=2, **blank))
+    intake.take(CLOUD, cloud(START_NS, scan(np.full((3, 3), 4.0))))
+    intake.take(LEFT, image(START_NS + 100_000_000, np.zeros((24, 32), np.uint8)))
+    (frame,) = synchronizer.flush()
+    assert frame.left is not None and frame.left.shape == (24, 32)
+    assert (frame.camera.width, frame.camera.height, frame.camera.fx) == (32, 24, 30)
+    assert len(told) == (not calibrated)
+
+
+def test_images_of_no_reading_are_refused_with_both_sizes(synchronizer: Synchronizer) -> None:
+    told: list[str] = []
+    intake = MessageRouter(synchronizer, Topics(right_image="", right_info="", odometry=""), told.append)
+    intake.take(LEFT_INFO, camera_info(START_NS, 60.0, (64, 48), binning_x=2, binning_y=2))
+    intake.take(LEFT, image(START_NS, np.zeros((24, 40), np.uint8)))
+    assert told == [f"{LEFT}: image of 40 x 24 pixels, the calibration is for 32 x 24; such messages are skipped"]
 
 
 def take_frame(intake: MessageRouter, synchronizer: Synchronizer, at_s: float) -> float:

@@ -3,12 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from recordings import drive
+from scipy.spatial.transform import Rotation
 from streams import MS, OFFSET, T0, Measurement, S, check_accounts, feed, in_order, picture, points, rover, same
 
 from umf_ros.core.config import Sync
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import Frame, StereoCamera
-from umf_ros.core.geometry import invert, transform
+from umf_ros.core.geometry import invert, make_pose, transform
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.synchronizer import INPUTS, Synchronizer
@@ -294,3 +295,100 @@ def test_a_lidar_that_comes_back_is_what_frames_are_built_around_again(calibrati
     frames = feed(synchronizer, in_order(streams)) + synchronizer.flush()
     late = [frame for frame in frames if frame.stamp_ns > T0 + 11 * S]
     assert late and all(frame.points is not None for frame in late)
+
+
+def whole_scan(count: int = 4000, duration_ns: int = 100 * MS) -> Cloud:
+    """A rotation of a room's walls, by azimuth."""
+    azimuth = np.linspace(-np.pi, np.pi, count, endpoint=False)
+    up = np.tile(np.linspace(-0.25, 0.25, 16), count // 16)
+    xyz = 5 * np.stack([np.cos(azimuth) * np.cos(up), np.sin(azimuth) * np.cos(up), np.sin(up)], 1)
+    times = np.linspace(0, duration_ns, count, endpoint=False).astype(np.int64)
+    return Cloud(xyz.astype(np.float32), np.full(count, 50, np.float32), times)
+
+
+def cut(cloud: Cloud, count: int, timed: bool, bands: bool) -> list[tuple[int, Cloud]]:
+    """Stamps after the scan's, and parts: sectors, or bands of elevation."""
+    assert cloud.time_offset_ns is not None and cloud.intensity is not None
+    order = np.argsort(cloud.points[:, 2], kind="stable") if bands else np.arange(len(cloud.points))
+    parts = []
+    for number, rows in enumerate(np.array_split(order, count)):
+        start = number * 100 * MS // count
+        times = np.linspace(0, 100 * MS // count, len(rows), endpoint=False).astype(np.int64) if timed else None
+        parts.append((start, Cloud(cloud.points[rows], cloud.intensity[rows], times)))
+    return parts
+
+
+@pytest.mark.parametrize("timed", [True, False])
+@pytest.mark.parametrize("bands", [True, False])
+@pytest.mark.parametrize(("count", "every_ms"), [(4, 100), (10, 100), (2, 100), (4, 250)])
+def test_parts_of_a_scan_are_joined(
+    calibration: Calibration, count: int, every_ms: int, bands: bool, timed: bool
+) -> None:
+    synchronizer = Synchronizer(Sync(), calibration, {"cloud"})
+    stream = [
+        ("cloud", T0 + scan * every_ms * MS + start, part)
+        for scan in range(12)
+        for start, part in cut(whole_scan(), count, timed, bands and count < 10)
+    ]
+    frames = feed(synchronizer, stream) + synchronizer.flush()
+    whole = [frame for frame in frames if frame.points is not None and len(frame.points) == 4000]
+    assert len(whole) >= 12 - 2 - 6 // count and len(frames) - len(whole) <= 8
+    if every_ms > 100:  # after a pause a scan begins
+        starts = {scan * every_ms * MS for scan in range(12)}
+        assert {frame.stamp_ns - OFFSET - T0 for frame in whole} <= starts
+    assert synchronizer.counters["cloud"].used == 12 * count
+    check_accounts(synchronizer)
+
+
+def test_a_joined_scan_is_deskewed_by_the_stamps_of_its_parts(calibration: Calibration) -> None:
+    synchronizer = Synchronizer(Sync(), calibration, {"cloud", "odometry"})
+    poses = [("odometry", T0 + at * 10 * MS, drive(at / 100)) for at in range(-10, 160)]
+    parts, truth, begins = [], [], {}
+    for start in range(0, 1200 * MS, 100 * MS):
+        for after, part in cut(whole_scan(), 4, True, False):
+            assert part.time_offset_ns is not None
+            begins[T0 + start + after + OFFSET] = sum(map(len, truth))
+            parts.append(("cloud", T0 + start + after, part))
+            at_s = (start + after + part.time_offset_ns[:, None]) * 1e-9
+            truth.append(
+                [
+                    transform(drive(one) @ calibration.body_T_lidar, point[None])[0]
+                    for one, point in zip(at_s[:, 0], part.points, strict=True)
+                ]
+            )
+    frames = feed(synchronizer, in_order({"o": poses, "c": parts})) + synchronizer.flush()
+    whole = [frame for frame in frames if frame.points is not None and len(frame.points) == 4000]
+    assert len(whole) >= 9
+    for frame in whole:
+        assert frame.odom_T_body is not None and frame.points is not None
+        first = begins[frame.stamp_ns]
+        expected = np.concatenate(truth)[first : first + 4000]
+        np.testing.assert_allclose(transform(frame.odom_T_body, frame.points), expected, atol=2e-3)
+
+
+def test_packets_of_the_whole_view_are_joined_by_time(calibration: Calibration, rng: np.random.Generator) -> None:
+    synchronizer = Synchronizer(Sync(), calibration, {"cloud"})
+    for at in range(100):
+        rows = rng.choice(4000, 400, replace=False)
+        cloud = whole_scan()
+        part = Cloud(cloud.points[rows], None, np.sort(rng.integers(0, 10 * MS, 400)))
+        feed_one = synchronizer.add("cloud", T0 + at * 10 * MS, part)
+        assert feed_one is None
+    frames = synchronizer.pop() + synchronizer.flush()
+    counts = [len(frame.points) for frame in frames[6:] if frame.points is not None]
+    assert counts[:-1] == [4000] * (len(counts) - 1) and len(counts) >= 9
+    check_accounts(synchronizer)
+
+
+@pytest.mark.parametrize("period_ms", [25, 50, 100, 200])
+def test_whole_scans_are_never_joined(calibration: Calibration, period_ms: int) -> None:
+    """Not even of a rover that turns by 10 deg between them, nor on another channel of the walls."""
+    synchronizer = Synchronizer(Sync(), calibration, {"cloud"})
+    full = whole_scan()
+    for at in range(20):
+        turned = transform(
+            make_pose(Rotation.from_euler("z", 10 * at, degrees=True).as_matrix(), [0, 0, 0]), full.points
+        )
+        narrow = np.abs(turned[:, 1]) < turned[:, 0]
+        synchronizer.add("cloud", T0 + at * period_ms * MS, Cloud(turned[narrow].astype(np.float32)))
+        assert len(synchronizer.pop()) == 1

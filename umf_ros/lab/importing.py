@@ -352,6 +352,35 @@ def _raw_files(source: Path) -> list[tuple[int, Path]]:
     return _in_order(source / "data", times.tolist())
 
 
+LENSES = {
+    **dict.fromkeys(("radial-tangential", "radtan", "plumb_bob", "rational_polynomial", "thin_prism"), "radtan"),
+    **dict.fromkeys(("equidistant", "equi", "fisheye", "kannala-brandt", "kannala_brandt"), "equidistant"),
+}
+"""Names of distortion models by the programs that write them, and those of a calibration file."""
+
+
+def lens(path: Path, camera: object, distortion: object, coefficients: Any) -> dict[str, Any]:
+    """Entries `distortion` and `distortion_model` of a raw camera.
+
+    Args:
+        path: file that holds them.
+        camera: name of the camera model; None: a pinhole.
+        distortion: name of the distortion model; "none", or None: there is none.
+        coefficients: a list of numbers, in OpenCV's order.
+
+    Raises:
+        SensorFileError: the model, which is named, cannot be rectified.
+    """
+    models = str(camera or "pinhole").lower(), str(distortion or "none").lower()
+    known = LENSES.get(models[1]) or ("radtan" if models[1] == "none" else "")
+    if models[0] != "pinhole" or not known:
+        raise SensorFileError(
+            f"{path}: the model {'-'.join(models)} cannot be rectified; only pinhole with radtan or equidistant can"
+        )
+    numbers = [] if models[1] == "none" else [float(value) for value in coefficients]
+    return {"distortion": numbers, "distortion_model": known}
+
+
 def _asl_camera(source: Path) -> tuple[dict[str, Any], Array]:
     path = source / "sensor.yaml"
     try:
@@ -359,11 +388,12 @@ def _asl_camera(source: Path) -> tuple[dict[str, Any], Array]:
         width, height = content["resolution"]
         fx, fy, cx, cy = content["intrinsics"]
         mounted = np.array(content["T_BS"]["data"], float).reshape(4, 4)
-        distortion = [float(value) for value in content["distortion_coefficients"]]
+        models = content.get("camera_model"), content.get("distortion_model", "radtan")
+        distortion = lens(path, *models, content.get("distortion_coefficients"))
     except (KeyError, TypeError, ValueError) as error:
         raise SensorFileError(f"{path}: expected resolution, intrinsics, distortion and T_BS ({error})") from None
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return pinhole(width, height, matrix, distortion=distortion), mounted
+    return pinhole(width, height, matrix, **distortion), mounted
 
 
 def _asl_files(source: Path) -> list[tuple[int, Path]]:

@@ -18,7 +18,10 @@ from umf_ros.runs.run_file import read_absolute_verdicts
 from umf_ros.runs.truth import JudgedRun, in_words
 from umf_ros.sensors.sensor_check import SENSORS, Overlay, SensorReport, describe_turn, find_contradictions
 
-REFUSED = ("size", "encoding", "step", "truncated", "compressed", "fields", "datatype", "unusable", "stamp")
+REFUSED = (
+    *("size", "encoding", "step", "truncated", "compressed", "fields", "datatype", "unusable", "stamp"),
+    *("camera_info", "transforms"),
+)
 """Reasons for which a message is unusable by itself."""
 MUCH_MISSED, MUCH_REJECTED, WELL_COVERED = 0.3, 0.2, 0.5
 """Shares, by hand: of revisits, of closures, of keyframes."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from umf_ros.core.geometry import Array, invert, relative, transform
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
+from umf_ros.sensors.point_times import LONGEST_SWEEP_NS
 from umf_ros.sensors.sessions import StampedInput
 
 Mask = NDArray[np.bool_]
@@ -182,16 +185,111 @@ class ScanLimits:
             self._warn(text)
 
 
+FEW, DECIDING = 100, 6
+"""Returns of a message by which it can be recognised as a part, and messages that decide (*by hand*)."""
+APART, ANEW = 0.3, 0.6
+"""Overlap of directions below which two messages are parts, and about which one begins a scan (*by hand*)."""
+FASTEST_NS, PACKETS_NS, GAP = 20_000_000, 100_000_000, 3
+"""Shortest period of whole scans, length of a scan of packets, and longest gap in a scan in periods (*by hand*)."""
+
+
+class Scan(NamedTuple):
+    """A whole scan: the stamp of its first message, its returns, and the number of its messages."""
+
+    stamp_ns: int
+    cloud: Cloud
+    messages: int = 1
+
+
+class ScanJoiner:
+    """Joins the parts of scans, for drivers that publish sectors, bands or packets of a rotation.
+
+    The first messages decide whether there is anything to join: successive parts of a scan look in different
+    directions, packets follow each other faster than any LiDAR rotates. Each part keeps its own stamp.
+    """
+
+    def __init__(self) -> None:
+        self._parts: list[tuple[int, Cloud, Mask]] = []
+        self._kind: Literal["", "whole", "parts", "packets"] = ""
+        self._period_ns = 0
+
+    def add(self, stamp_ns: int, cloud: Cloud) -> list[Scan]:
+        """Take the next message; return the scans that are known to be whole by now."""
+        if self._kind == "whole" or (not self._kind and len(cloud.points) < FEW):
+            return [Scan(stamp_ns, cloud)]
+        part = stamp_ns, cloud, _directions(cloud)
+        undecided = not self._kind
+        done = self.flush() if not undecided and self._parts and self._begins(stamp_ns, part[2]) else []
+        self._parts.append(part)
+        if undecided:
+            self._decide()
+        return [Scan(stamp_ns, cloud)] if undecided else done
+
+    def flush(self) -> list[Scan]:
+        """Return the scan whose parts wait, at the end of a session."""
+        parts, self._parts = self._parts if self._kind else [], []
+        return [_join(parts)] if parts else []
+
+    def _decide(self) -> None:
+        """Decide by the first messages, which were used one by one."""
+        if len(self._parts) < DECIDING:
+            return
+        stamps, _, seen = zip(*self._parts, strict=True)
+        self._period_ns, self._parts = int(np.median(np.diff(stamps))), []
+        if min(_overlap(one, other) for one, other in combinations(seen, 2)) < APART:
+            self._kind = "parts"
+        else:
+            self._kind = "packets" if self._period_ns < FASTEST_NS else "whole"
+
+    def _begins(self, stamp_ns: int, seen: Mask) -> bool:
+        """Return whether a message begins a new scan."""
+        longest_ns = PACKETS_NS if self._kind == "packets" else LONGEST_SWEEP_NS
+        if stamp_ns - self._parts[-1][0] > GAP * self._period_ns:
+            return True
+        if stamp_ns - self._parts[0][0] > longest_ns - self._period_ns // 2:
+            return True
+        # seen before, but not just before
+        before = np.logical_or.reduce([one for *_, one in self._parts])
+        return self._kind == "parts" and _overlap(seen, self._parts[-1][2]) < ANEW < _overlap(seen, before)
+
+
+def _directions(cloud: Cloud) -> Mask:
+    """Return the directions (37, 73), by 10 deg around and 2.5 deg up, in which a message has returns."""
+    x, y, z = cloud.points.T
+    around, up = np.degrees(np.arctan2(y, x)) / 10 + 18, np.degrees(np.arctan2(z, np.hypot(x, y))) / 2.5 + 36
+    seen = np.zeros((37, 73), bool)
+    seen[around.astype(int), up.astype(int)] = True
+    return seen
+
+
+def _overlap(one: Mask, other: Mask) -> float:
+    """Return the share of the directions of one of two messages, the narrower one, that are also the other's."""
+    return int((one & other).sum()) / max(1, min(int(one.sum()), int(other.sum())))
+
+
+def _join(parts: Sequence[tuple[int, Cloud, Mask]]) -> Scan:
+    first_ns, points = parts[0][0], np.concatenate([cloud.points for _, cloud, _ in parts])
+    strengths = [cloud.intensity for _, cloud, _ in parts if cloud.intensity is not None]
+    offsets = [
+        np.full(len(cloud.points), stamp_ns - first_ns) + (0 if cloud.time_offset_ns is None else cloud.time_offset_ns)
+        for stamp_ns, cloud, _ in parts
+    ]
+    intensity = np.concatenate(strengths) if len(strengths) == len(parts) else None
+    return Scan(first_ns, Cloud(points, intensity, np.concatenate(offsets)), len(parts))
+
+
 @dataclass(frozen=True, slots=True)
 class Anchor:
     """The measurement a frame is built around: a scan in the LiDAR frame, or an image where there is no LiDAR.
 
     `stamp_ns` is the key of the frame, `measured_ns` the stamp of the message: time offsets of points count from there.
+    `messages` is the number of the scan's.
     """
 
     stamp_ns: int
     measured_ns: int
     cloud: Cloud | None = None
+    messages: int = 1
 
     def span_ns(self) -> tuple[int, int]:
         """Return stamps of the first and the last point; the key where the driver sends no times."""

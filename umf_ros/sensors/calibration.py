@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,6 +24,26 @@ LARGEST_IMAGE = 20_000
 """Pixels of a side."""
 
 
+class SensorWindow(NamedTuple):
+    """Part of the full sensor that an image shows: its offset and size in pixels of the sensor, and the binning."""
+
+    sensor: tuple[int, int]
+    offset: tuple[int, int]
+    part: tuple[int, int]
+    binning: tuple[int, int]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image."""
+        return self.part[0] // self.binning[0], self.part[1] // self.binning[1]
+
+    def intrinsics(self, full: Pinhole | StereoCamera) -> dict[str, Any]:
+        """Return the intrinsics of the image by those of the full sensor; pixel (0, 0) is a pixel's centre."""
+        (x, y), (across, down), (width, height) = self.offset, self.binning, self.size
+        centre = {"cx": (full.cx - x + 0.5) / across - 0.5, "cy": (full.cy - y + 0.5) / down - 0.5}
+        return {"width": width, "height": height, "fx": full.fx / across, "fy": full.fy / down, **centre}
+
+
 class Pinhole(Group):
     """Intrinsics in pixels."""
 
@@ -35,16 +56,21 @@ class Pinhole(Group):
 
 
 class RawCamera(Pinhole):
-    """A camera with lens distortion: k1 k2 p1 p2 k3 k4 k5 k6 as far as known."""
+    """A camera with lens distortion, in OpenCV's order.
+
+    `radtan`: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty as far as known; `equidistant`, a fisheye: k1 k2 k3 k4.
+    """
 
     distortion: tuple[float, ...]
+    distortion_model: Literal["radtan", "equidistant"] = "radtan"
 
-    @field_validator("distortion")
-    @classmethod
-    def _in_opencv_order(cls, distortion: tuple[float, ...]) -> tuple[float, ...]:
-        if len(distortion) not in (0, 4, 5, 8):
-            raise ValueError("expected 0, 4, 5 or 8 coefficients: k1 k2 p1 p2 k3 k4 k5 k6")
-        return distortion
+    @model_validator(mode="after")
+    def _in_opencv_order(self) -> RawCamera:
+        counts = (0, 4) if self.distortion_model == "equidistant" else (0, 4, 5, 8, 12, 14)
+        if len(self.distortion) not in counts:
+            expected = ", ".join(map(str, counts))
+            raise ValueError(f"{self.distortion_model}: expected one of {expected} coefficients, in OpenCV's order")
+        return self
 
     def matrix(self, size: tuple[int, int]) -> Array:
         """Return (3, 3) intrinsics of the image scaled to `size`; pixel (0, 0) is a pixel's centre."""
@@ -61,18 +87,27 @@ class StereoRectifier:
 
     def __init__(self, left: RawCamera, right: RawCamera, left_T_right: Array, size: tuple[int, int]) -> None:
         """Prepare the maps; `size` is the width and height of the result."""
+        if left.distortion_model != right.distortion_model:
+            raise ValueError("both cameras need the same distortion_model")
         self.raw_size = (left.width, left.height)
-        self._size = size
+        self._size, self._pair, self._left_T_right = size, (left, right), left_T_right
         right_T_left = invert(left_T_right)
         matrices = [camera.matrix(size) for camera in (left, right)]
         distortions = [np.array(camera.distortion or (0.0,) * 4) for camera in (left, right)]
         both = matrices[0], distortions[0], matrices[1], distortions[1]
-        turn, shift = right_T_left[:3, :3], right_T_left[:3, 3:]
         # Bouguet's method, without black borders
-        result = cv2.stereoRectify(*both, size, turn, shift, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)
+        fisheye = left.distortion_model == "equidistant"
+        functions: Any = cv2.fisheye if fisheye else cv2
+        black = {"balance": 0.0} if fisheye else {"alpha": 0}
+        turn, shift = right_T_left[:3, :3].copy(), right_T_left[:3, 3:].copy()  # contiguous, as fisheye wants them
+        result = functions.stereoRectify(*both, size, turn, shift, flags=cv2.CALIB_ZERO_DISPARITY, **black)
         turns, projections = result[:2], result[2:4]
-        self._maps = [
-            cv2.initUndistortRectifyMap(matrix, distortion, turn, projection[:, :3], size, cv2.CV_16SC2)
+        # a fisheye's whole view is too wide for a plane: its centre keeps its resolution
+        larger = max(1.0, matrices[0][0, 0] / projections[0][0, 0]) if fisheye else 1.0
+        for projection in projections:
+            projection[[0, 1, 0], [0, 1, 3]] *= larger
+        self._maps: list[Any] = [
+            functions.initUndistortRectifyMap(matrix, distortion, turn, projection[:, :3], size, cv2.CV_16SC2)
             for matrix, distortion, turn, projection in zip(matrices, distortions, turns, projections, strict=True)
         ]
         self.raw_T_rectified = make_pose(turns[0].T, (0, 0, 0))
@@ -80,11 +115,19 @@ class StereoRectifier:
         baseline = -float(projections[1][0, 3]) / fx
         self.camera = StereoCamera(*size, fx, fy, cx, cy, baseline)
 
+    def within(self, window: SensorWindow) -> StereoRectifier:
+        """Return the rectification of raw images that show a window of these."""
+        left, right = (camera.model_copy(update=window.intrinsics(camera)) for camera in self._pair)
+        (width, height), (across, down) = window.size, (self.raw_size[i] / self._size[i] for i in (0, 1))
+        size = min(width, round(window.part[0] / across)), min(height, round(window.part[1] / down))
+        return StereoRectifier(left, right, self._left_T_right, size)
+
     def apply(self, raw: Image, side: int) -> Image:
         """Return the rectified image, (H, W) uint8, of a raw one; `side` 0: left, 1: right."""
         # area averaging first: the remap below takes four pixels only and would alias
         small = cv2.resize(raw, self._size, interpolation=cv2.INTER_AREA)
-        return np.asarray(cv2.remap(small, *self._maps[side], interpolation=cv2.INTER_LINEAR), np.uint8)
+        across, down = self._maps[side]
+        return np.asarray(cv2.remap(small, across, down, interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +162,15 @@ class Calibration:
     def image_size(self) -> tuple[int, int]:
         """Width and height of the images that arrive."""
         return self.rectifier.raw_size if self.rectifier else (self.camera.width, self.camera.height)
+
+    def within(self, window: SensorWindow, size: tuple[int, int]) -> Calibration:
+        """Return the calibration for images of `size` that show a window of the sensor; itself if they do not."""
+        if size == self.image_size or (window.size, window.sensor) != (size, self.image_size):
+            return self
+        if self.rectifier is not None:
+            rectifier = self.rectifier.within(window)
+            return replace(self, rectifier=rectifier, camera=rectifier.camera)
+        return replace(self, camera=replace(self.camera, **window.intrinsics(self.camera)))
 
     def with_camera(self, camera: StereoCamera) -> Calibration:
         """Return this calibration with the intrinsics of a camera_info; a baseline of 0 keeps the one known here."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -13,21 +13,24 @@ from numpy.typing import NDArray
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import Image, Points, StereoCamera
 from umf_ros.core.geometry import Array, from_quaternion
-from umf_ros.sensors.calibration import LARGEST_IMAGE
+from umf_ros.sensors.calibration import LARGEST_IMAGE, SensorWindow
+from umf_ros.sensors.point_times import TIME_NAMES, PointTimes
 
+_COLOURS = {name: getattr(cv2, f"COLOR_{name.upper()}2GRAY") for name in ("rgb", "bgr", "rgba", "bgra")}
+# ROS names the upper left 2x2 pixels; the names of OpenCV's older constants start one pixel further
+_MOSAICS = {
+    f"bayer_{name}": getattr(cv2, f"COLOR_Bayer{name.upper()}2GRAY") for name in ("rggb", "bggr", "gbrg", "grbg")
+}
 # encoding -> channels, bytes per channel, OpenCV's conversion to grey
 _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
-    **dict.fromkeys(("mono8", "8UC1"), (1, 1, None)),
-    "mono16": (1, 2, None),
+    **{name: (1, 1 if "8" in name else 2, None) for name in ("mono8", "8UC1", "mono16", "16UC1")},
     **{
-        f"{name}8": (len(name), 1, getattr(cv2, f"COLOR_{name.upper()}2GRAY"))
-        for name in ("rgb", "bgr", "rgba", "bgra")
+        f"{name}{8 * size}": (len(name) if name in _COLOURS else 1, size, conversion)
+        for name, conversion in (_COLOURS | _MOSAICS).items()
+        for size in (1, 2)
     },
-    # ROS names the upper left 2x2 pixels; the names of OpenCV's older constants start one pixel further
-    **{
-        f"bayer_{name}8": (1, 1, getattr(cv2, f"COLOR_Bayer{name.upper()}2GRAY"))
-        for name in ("rggb", "bggr", "gbrg", "grbg")
-    },
+    # OpenCV's own names: colours in its order
+    **{f"{8 * size}UC{len(name)}": (len(name), size, _COLOURS[name]) for name in ("bgr", "bgra") for size in (1, 2)},
     **dict.fromkeys(("yuv422", "uyvy"), (2, 1, cv2.COLOR_YUV2GRAY_UYVY)),
     **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, 1, cv2.COLOR_YUV2GRAY_YUY2)),
 }
@@ -39,19 +42,22 @@ LAST_STAMP_NS = 2**31 * 10**9
 """Upper bound of stamps with 32-bit seconds."""
 FURTHEST_M = 1e7
 """Largest distance of odometry from its origin: a quarter of the Earth's circumference."""
+_SAME_PX, _SAME_SHARE = 1.0, 0.003
+"""Largest differences of centre and focal length within a rectified pair (*by hand*): some hundredths of the depth."""
+_BASELINES_M = 0.005, 10.0
+"""Limits of a baseline (*by hand*)."""
 NARROWEST_RAD, WIDEST_RAD = 0.02, 3.1
 """Limits of a rectified camera's field of view."""
+_EXTREMES, _SAMPLES = (0.1, 99.9), 20_000
+"""Percentiles of grey values within the range, and the number of values that they are taken of (*by hand*)."""
+_FAR_FROM_ZERO = 0.75
+"""Least darkest over brightest value of an image whose range does not begin at 0 (*by hand*)."""
 LARGEST_RECORD = 4096
 """Most bytes of a point; drivers have some dozens."""
 INTENSITY_NAMES = ("intensity", "scalar_intensity", "reflectivity", "reflectance", "remission", "i")
 """Fields of the strength of a return, by driver; the second is CloudCompare's."""
-TIME_NAMES = ("point_time_offset", "offset_time", "t", "time", "time_offset", "timestamp")
-"""Fields of the time of a point: whole numbers are ns, others s; Blickfeld, Livox, Ouster, Velodyne, Hesai."""
 FURTHEST_RETURN_M = 1e4
 """Largest range of a return (*by hand*); grids over points further apart run out of cells."""
-LONGEST_SWEEP_NS = 1_000_000_000
-LARGEST_TIME = 9e18
-"""Upper bound of times of points, in any unit: stamps are integers of 64 bits."""
 NO_RETURN_RANGE_M = 1.0
 """Range that the Blickfeld driver gives pulses without a return, with intensity 0."""
 
@@ -101,23 +107,46 @@ def stamp_ns(message: Any) -> int:
     return nanoseconds
 
 
-def decode_image(message: Any) -> Image:
+class GreyRange:
+    """Range of 16-bit grey values of a rig's cameras; sensors of 10, 12 or 14 bits and thermal ones use a part.
+
+    It is a power of two and only grows, when an image leaves it, so that the brightness does not flicker.
+    """
+
+    def __init__(self) -> None:
+        self._seen = np.inf, 0.0
+        self._low, self._bits = 0, 8
+
+    def to_bytes(self, values: NDArray[np.uint16]) -> Image:
+        """Return grey values as (H, W) uint8, as the range of all images so far has them."""
+        sparse = values.ravel()[:: values.size // _SAMPLES | 1]  # odd: of all colours of a mosaic
+        darkest, brightest = np.percentile(sparse, _EXTREMES)
+        if darkest < self._low or brightest >= self._low + 2**self._bits:
+            low, high = self._seen = min(self._seen[0], darkest), max(self._seen[1], brightest)
+            far = low > _FAR_FROM_ZERO * high  # from zero, as counts of thermal cameras
+            self._bits = max(8, int(2 * (high - low) if far else high).bit_length())
+            self._low = max(0, int(low + high) // 2 - 2 ** (self._bits - 1)) if far else 0
+        clipped = np.clip(values, self._low, min(self._low + 2**self._bits, 2**16) - 1)
+        return ((clipped - self._low) >> (self._bits - 8)).astype(np.uint8)
+
+
+def decode_image(message: Any, grey: GreyRange | None = None) -> Image:
     """Return the grey image (H, W) uint8 of a sensor_msgs/Image, which may share its memory, or of a CompressedImage.
 
-    16-bit images are taken as full scale: the upper byte is kept.
+    `grey` knows the images before; without it, this image alone decides the range of 16-bit values.
 
     Raises:
         MessageError: of kind "encoding", "size", "step" or "truncated"; of kind "compressed" when the content is no
             picture, or one of depths.
     """
     if not hasattr(message, "encoding"):
-        return _decode_compressed(message)
+        return _decode_compressed(message, grey)
     if message.encoding not in _ENCODINGS:
         raise MessageError("encoding", f"image encoding {message.encoding!r} is not supported")
     channels, size, conversion = _ENCODINGS[message.encoding]
     rows = _image_rows(message, row_bytes=message.width * channels * size)
     if size == 2:
-        return np.ascontiguousarray(rows[:, (0 if message.is_bigendian else 1) :: 2])
+        rows = (grey or GreyRange()).to_bytes(rows.view(">u2" if message.is_bigendian else "<u2"))
     if channels > 1:
         rows = rows.reshape(message.height, message.width, channels)
     return rows if conversion is None else np.asarray(cv2.cvtColor(rows, conversion), np.uint8)
@@ -138,15 +167,22 @@ def _image_rows(message: Any, row_bytes: int) -> Image:
     return np.ascontiguousarray(data.reshape(message.height, message.step)[:, :row_bytes])
 
 
-def decode_cloud(message: Any) -> Cloud:
+def decode_cloud(message: Any, times: PointTimes | None = None) -> Cloud:
     """Return the real returns, possibly none, of a Livox CustomMsg or a PointCloud2 with fields of known names.
+
+    `times` knows the scans before; without it, this scan alone decides the unit of its times.
 
     Raises:
         MessageError: of kind "fields", "datatype", "step" or "truncated".
     """
     records = _cloud_records(message) if hasattr(message, "fields") else _livox_records(message)
     cloud, real = real_returns(records, records.dtype.names or ())
-    return replace(cloud, time_offset_ns=_time_offsets_ns(records, real, message))
+    name = next((name for name in TIME_NAMES if name in (records.dtype.names or ())), None)
+    if name is None:
+        return cloud
+    stamp = message.header.stamp
+    sent_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return replace(cloud, time_offset_ns=(times or PointTimes()).offsets_ns(records[name][real], sent_ns))
 
 
 def real_returns(columns: Any, names: Collection[str]) -> tuple[Cloud, NDArray[np.bool_]]:
@@ -165,26 +201,6 @@ def real_returns(columns: Any, names: Collection[str]) -> tuple[Cloud, NDArray[n
         dummy &= intensity == 0
     real = (squared > 0) & (squared <= FURTHEST_RETURN_M**2) & ~dummy  # both are false for NaN
     return Cloud(points[real], None if intensity is None else intensity[real]), real
-
-
-def _time_offsets_ns(records: NDArray[Any], real: NDArray[np.bool_], message: Any) -> NDArray[np.int64] | None:
-    """Return ns from the message's stamp to real returns; drivers count from there or the epoch. None without times."""
-    name = next((name for name in TIME_NAMES if name in (records.dtype.names or ())), None)
-    if name is None:
-        return None
-    times = records[name][real]
-    if times.dtype.kind == "f" and not (np.abs(times) < LARGEST_TIME).all():  # true for NaN
-        return None
-    if times.dtype.kind in "ui":
-        offsets = times.astype(np.int64)
-    elif len(times) and times[0] > 1e17:  # ns since the epoch, as Livox' driver for PCL writes them
-        offsets = (times - float(stamp_ns(message))).astype(np.int64)
-    elif len(times) and times[0] > 1e8:  # s since the epoch, as Hesai writes them
-        offsets = np.rint((times - stamp_ns(message) * 1e-9) * 1e9).astype(np.int64)
-    else:
-        offsets = np.rint(times.clip(-1e9, 1e9).astype(float) * 1e9).astype(np.int64)
-    # no sweep takes a second: such offsets count from another origin
-    return offsets if not len(offsets) or np.abs(offsets).max() < LONGEST_SWEEP_NS else None
 
 
 def _cloud_records(message: Any) -> NDArray[Any]:
@@ -214,10 +230,13 @@ def _cloud_records(message: Any) -> NDArray[Any]:
 def _record_type(fields: list[Any], point_step: int, order: str) -> np.dtype[Any]:
     formats = []
     for field in fields:
-        if field.datatype not in _DATATYPES or field.count > 1:
+        kind = _DATATYPES.get(field.datatype)
+        if field.name in TIME_NAMES and (kind, field.count) == ("u4", 2):  # 64 bits, for which there is no datatype
+            kind = "u8"
+        elif kind is None or field.count > 1:
             text = f"cloud field {field.name} has datatype {field.datatype} and count {field.count}"
             raise MessageError("datatype", text)
-        formats.append(np.dtype(order + _DATATYPES[field.datatype]))
+        formats.append(np.dtype(order + kind))
         if field.offset + formats[-1].itemsize > point_step:
             raise MessageError("step", f"cloud field {field.name} lies outside the point step of {point_step} bytes")
     names, offsets = [field.name for field in fields], [field.offset for field in fields]
@@ -247,38 +266,74 @@ def decode_pose(pose: Any) -> Array:
         raise MessageError("pose", f"pose with {error}") from None
 
 
-def decode_camera_info(left: Any, right: Any | None = None) -> StereoCamera:
+def decode_camera_info(
+    left: Any,
+    right: Any | None = None,
+    size: tuple[int, int] | None = None,
+    warn: Callable[[str], None] = lambda _: None,
+) -> StereoCamera:
     """Return the rectified pair of one or two sensor_msgs/CameraInfo; without the right one the baseline is 0.
+
+    Call `warn` about a pair that is unusual but usable. `size` is that of the images, where it is known.
 
     Raises:
         MessageError: of kind "camera_info": no calibrated camera, or no pair.
     """
-    matrix = _projection(left, "left")
-    baseline = 0.0
-    if right is not None:
-        other = _projection(right, "right")
-        baseline = -float(other[0, 3]) / float(other[0, 0])
-        if not baseline > 0:
-            raise MessageError("camera_info", f"right camera_info has a baseline of {baseline:.4g} m")
+    camera, matrix = _as_imaged(left, size)
+    if right is None:
+        return camera
+    other, other_matrix = _as_imaged(right, size)
+    apart = [abs(one - another) for one, another in ((camera.cx, other.cx), (camera.cy, other.cy))]
+    if max(apart) > _SAME_PX or abs(other.fx / camera.fx - 1) > _SAME_SHARE:
+        numbers = " and ".join(f"fx {one.fx:.1f}, cx {one.cx:.1f}, cy {one.cy:.1f}" for one in (camera, other))
+        raise MessageError("camera_info", f"left and right camera_info are not of one rectified pair: {numbers}")
+    left_m, right_m = (-float(one[0, 3] / one[0, 0]) for one in (matrix, other_matrix))
+    baseline = right_m - left_m
+    if left_m and abs(baseline) < _BASELINES_M[0]:
+        baseline = right_m
+        warn(f"P[3] of the left camera_info is that of the right one: {baseline:.4g} m is taken as the baseline")
+    if not _BASELINES_M[0] <= baseline <= _BASELINES_M[1]:
+        text = f"right camera_info has a baseline of {baseline:.4g} m, by its P[3] of {other_matrix[0, 3]:.4g}"
+        raise MessageError("camera_info", f"{text}, which is -fx * metres in a right one")
+    if max(abs(matrix[0, 1]), abs(other_matrix[0, 1])) > _SAME_SHARE * camera.fx:
+        warn(f"P of camera_info is not that of a rectified camera: P[1] is {matrix[0, 1]:.4g}, expected 0")
+    return replace(camera, baseline=baseline)
+
+
+def window_of(info: Any) -> SensorWindow:
+    """Return the part of the sensor that the images of a sensor_msgs/CameraInfo show (REP 104; 0: 1, or all)."""
+    roi, binning = info.roi, (max(1, int(info.binning_x)), max(1, int(info.binning_y)))
+    part = int(roi.width or info.width), int(roi.height or info.height)
+    return SensorWindow((int(info.width), int(info.height)), (int(roi.x_offset), int(roi.y_offset)), part, binning)
+
+
+def _as_imaged(info: Any, size: tuple[int, int] | None) -> tuple[StereoCamera, Array]:
+    """Return the camera of the images, without a baseline, and P (3, 4) as it is in the message."""
+    matrix, window = _projection(info), window_of(info)
+    (x, y), (across, down), width = window.offset, window.binning, window.sensor[0]
+    if size == window.sensor != window.size:  # of all pixels in spite of them
+        (x, y), (across, down), window = (0, 0), (1, 1), window._replace(part=window.sensor, binning=(1, 1))
     fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return StereoCamera(int(left.width), int(left.height), fx, fy, cx, cy, baseline)
+    if abs(cx * across / width - 0.5) < abs(cx / width - 0.5):  # drivers that state the binned image's
+        fx, fy, cx, cy = fx * across, fy * down, cx * across, cy * down
+    return StereoCamera(*window.size, fx / across, fy / down, (cx - x) / across, (cy - y) / down, 0.0), matrix
 
 
-def _projection(info: Any, name: str) -> Array:
+def _projection(info: Any) -> Array:
     """Return (3, 4) projection of the rectified image; from K where the driver leaves P empty."""
     if max(info.width, info.height) > LARGEST_IMAGE:
-        raise MessageError("camera_info", f"{name} camera_info for {info.width} x {info.height} pixels")
+        raise MessageError("camera_info", f"camera_info for {info.width} x {info.height} pixels")
     matrix = np.array(info.p, dtype=float).reshape(3, 4)
     if not matrix.any():
         matrix[:, :3] = np.array(info.k, dtype=float).reshape(3, 3)
     width, height, fx, fy = float(info.width), float(info.height), matrix[0, 0], matrix[1, 1]
     if not (np.isfinite(matrix).all() and min(width, height, fx, fy) > 0):
-        raise MessageError("camera_info", f"{name} camera_info is not calibrated")
+        raise MessageError("camera_info", "camera_info is not calibrated")
     views = [2 * np.arctan2(size / 2, focal) for size, focal in ((width, fx), (height, fy))]
     centre = 0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height
     if not (all(NARROWEST_RAD < view < WIDEST_RAD for view in views) and 0.5 < fx / fy < 2 and centre):
         numbers = f"{width:.0f} x {height:.0f} pixels, fx {fx:.3g}, fy {fy:.3g}, centre {matrix[0, 2]:.3g}"
-        raise MessageError("camera_info", f"{name} camera_info of no real camera: {numbers}, {matrix[1, 2]:.3g}")
+        raise MessageError("camera_info", f"camera_info of no real camera: {numbers}, {matrix[1, 2]:.3g}")
     return matrix
 
 
@@ -295,10 +350,10 @@ TYPES: dict[str, tuple[str, ...]] = {
 """Types of message that a recording may have on the topic of each name in `Topics`."""
 
 
-def _decode_compressed(message: Any) -> Image:
+def _decode_compressed(message: Any, grey: GreyRange | None) -> Image:
     if "compressedDepth" in message.format:
         raise MessageError("compressed", "compressed depth image: name the topic of the camera")
-    image = decode_picture(message.data)
+    image = decode_picture(message.data, grey)
     if image is None:
         raise MessageError("compressed", f"compressed image of format {message.format!r} cannot be read")
     if "bayer" in message.format:  # the raw mosaic was compressed: smooth it as demosaicing would
@@ -307,12 +362,18 @@ def _decode_compressed(message: Any) -> Image:
     return image
 
 
-def decode_picture(content: bytes) -> Image | None:
-    """Return the (H, W) uint8 grey image of a compressed file, in the camera's orientation; None where it is none."""
+def decode_picture(content: bytes, grey: GreyRange | None = None) -> Image | None:
+    """Return the (H, W) uint8 grey image of a compressed file, in the camera's orientation; None where it is none.
+
+    `grey` as in `decode_image`.
+    """
     data = np.frombuffer(content, np.uint8)
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # intrinsics hold for unrotated images
-    image = cv2.imdecode(data, flags) if len(data) else None
-    return None if image is None else np.asarray(image, np.uint8)
+    # intrinsics hold for unrotated images
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image: Any = cv2.imdecode(data, flags) if len(data) else None
+    if image is not None and image.dtype == np.uint16:
+        return (grey or GreyRange()).to_bytes(image)
+    return None if image is None or image.dtype != np.uint8 else image
 
 
 def _livox_records(message: Any) -> NDArray[Any]:

@@ -11,13 +11,16 @@ import numpy as np
 from umf_ros.core.config import Topics
 from umf_ros.core.errors import MessageError, printable
 from umf_ros.sensors.decode import (
+    GreyRange,
     OdometrySample,
     decode_camera_info,
     decode_cloud,
     decode_image,
     stamp_ns,
+    window_of,
 )
 from umf_ros.sensors.odometry import OdometryDecoder
+from umf_ros.sensors.point_times import PointTimes
 from umf_ros.sensors.sessions import ODOMETRY, Input
 from umf_ros.sensors.synchronizer import SILENCE_NS, Synchronizer
 from umf_ros.sensors.tf import BodyFrames
@@ -31,6 +34,10 @@ _INPUTS: dict[str, Input] = {
     "right_info": "camera_info",
 }
 """The input of every topic, by its name in `Topics`."""
+
+
+EARLY_IMAGES = 60
+"""Most images that wait for their first camera_info."""
 
 
 def wanted_inputs(topics: Topics) -> set[Input]:
@@ -58,12 +65,16 @@ class MessageRouter:
         self._synchronizer = synchronizer
         self._on_odometry = on_odometry
         self._warn = lambda text: warn(printable(text))  # topics come from outside
-        self._warned: set[tuple[str, str]] = set()
+        self._warned = set[object]()
         self._is_raw = "rect" not in topics.left_image
         self._stereo_info = bool(topics.right_info and topics.right_image)
         self._infos: dict[str, tuple[Any, Any]] = {}
         self._said: dict[str, Any] = {}
-        self._used: tuple[Any, Any] | None = None
+        self._used: tuple[Any, Any, Any] | None = None
+        self._times, self._grey = PointTimes(lambda text: warn(f"{topics.cloud}: {text}")), GreyRange()
+        self._early: list[tuple[str, Any]] = []
+        self._size: tuple[int, int] | None = None
+        self._topics = topics
         self._entries = {getattr(topics, entry): entry for entry in _INPUTS}
         self._entries.pop("", None)
 
@@ -83,11 +94,25 @@ class MessageRouter:
         elif entry in ("left_info", "right_info"):
             self._use_info(entry, message)
         else:
-            if self._frames is not None and entry != "right_image":
-                sensor = "lidar" if entry == "cloud" else "camera"
-                self._synchronizer.use_mounting(self._frames.mounting(sensor, message.header.frame_id))
-            decode = decode_cloud if entry == "cloud" else decode_image
-            self._synchronizer.add(_INPUTS[entry], stamp_ns(message), decode(message))
+            self._take_sensor(entry, message)
+
+    def _take_sensor(self, entry: str, message: Any) -> None:
+        """Add an image or a scan; images before the first camera_info wait for it."""
+        awaits = self._synchronizer.awaits_camera
+        if entry != "cloud" and awaits and len(self._early) < EARLY_IMAGES:
+            self._early.append((entry, message))
+            return
+        early, self._early = ([], self._early) if awaits else (self._early, [])
+        for held in early:
+            self.take(getattr(self._topics, held[0]), held[1])
+        if self._frames is not None and entry != "right_image":
+            sensor = "lidar" if entry == "cloud" else "camera"
+            self._synchronizer.use_mounting(self._frames.mounting(sensor, message.header.frame_id))
+        value: Any = decode_cloud(message, self._times) if entry == "cloud" else decode_image(message, self._grey)
+        if entry == "left_image" and value.shape[::-1] != self._size:
+            self._size = value.shape[::-1]
+            self._use_infos(stamp_ns(message))
+        self._synchronizer.add(_INPUTS[entry], stamp_ns(message), value)
 
     @contextmanager
     def refusing(self, topic: str) -> Iterator[None]:
@@ -109,9 +134,14 @@ class MessageRouter:
         """Count a message that cannot be used, warn of the first of its kind; also for other consumers' topics."""
         if topic in self._entries:
             self._synchronizer.reject(_INPUTS[self._entries[topic]], error.kind)
-        if (topic, error.kind) not in self._warned:
-            self._warned.add((topic, error.kind))
-            self._warn(f"{topic}: {error}; such messages are skipped")
+            self._stereo_info &= self._entries[topic] != "right_info"  # not waited for
+        self._say(f"{topic}: {error}; such messages are skipped", (topic, error.kind))
+
+    def _say(self, text: str, kind: object = None) -> None:
+        """Warn of the first of a kind, by default of the same text."""
+        if (kind or text) not in self._warned:
+            self._warned.add(kind or text)
+            self._warn(text)
 
     def _use_info(self, entry: str, message: Any) -> None:
         """Use the camera_info of the pair, or the left one alone when the right camera is silent.
@@ -119,21 +149,32 @@ class MessageRouter:
         The first is used at once. A later one with other contents replaces it when it comes twice in a row:
         one message may be damaged, a camera with new settings repeats them.
         """
-        content = (message.width, message.height, bytes(np.array(message.k)), bytes(np.array(message.p)))
+        content = (window_of(message), bytes(np.array(message.k)), bytes(np.array(message.p)))
         repeated, self._said[entry] = self._said.get(entry) == content, content
         known = self._infos.get(entry, (None, None))[0]
         if content != known and (known is None or repeated):
+            self._synchronizer.use_window(window_of(message))
             decode_camera_info(message)
             if self._is_raw and self._frames is not None and self._frames.is_open and np.any(np.array(message.d)):
-                text = "the images are raw, with lens distortion: rectify them (image_proc), or name a calibration"
+                lens = f"lens distortion ({message.distortion_model or 'of no named model'})"
+                text = f"the images are raw, with {lens}: rectify them (image_proc), or name a calibration"
                 raise MessageError("raw", text)
             self._infos[entry] = content, message
+        self._use_infos(stamp_ns(message))
+
+    def _use_infos(self, now_ns: int) -> None:
+        """Use the latest camera_info for images of the size that was seen; the left one if they make no pair."""
         left, right = (self._infos.get(name, (None, None)) for name in ("left_info", "right_info"))
-        if left[1] is None or self._used == (left[0], right[0]):
+        if left[1] is None or self._used == (left[0], right[0], self._size):
             return
-        if right[1] is None and self._stereo_info and stamp_ns(message) - stamp_ns(left[1]) < SILENCE_NS:
+        if right[1] is None and self._stereo_info and now_ns - stamp_ns(left[1]) < SILENCE_NS:
             return
-        first, self._used = not self._used, (left[0], right[0])
-        self._synchronizer.use_camera(decode_camera_info(left[1], right[1]))
-        if not first and right[1] is not None:
-            self._warn(f"{entry}: the intrinsics changed; the new ones are used from now on")
+        before, self._used = self._used, (left[0], right[0], self._size)
+        try:
+            camera = decode_camera_info(left[1], right[1], self._size, self._say)
+        except MessageError as error:
+            self._say(f"{self._topics.right_info}: {error}; the left camera is used alone")
+            camera = decode_camera_info(left[1], None, self._size)
+        self._synchronizer.use_camera(camera)
+        if before is not None and before[:2] != self._used[:2] and right[1] is not None:
+            self._warn("camera_info: the intrinsics changed; the new ones are used from now on")

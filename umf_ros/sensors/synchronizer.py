@@ -11,8 +11,8 @@ from typing import Any
 from umf_ros.core.config import Sync
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import Frame, StereoCamera
-from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, assemble
-from umf_ros.sensors.calibration import Calibration
+from umf_ros.sensors.assembly import Anchor, OdometryBuffer, Scan, ScanJoiner, ScanLimits, assemble
+from umf_ros.sensors.calibration import Calibration, SensorWindow
 from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.sessions import ODOMETRY, Input, SessionClock, StampedInput
 
@@ -122,7 +122,8 @@ class Synchronizer:
         self.counters: dict[Input, InputCounter] = {name: InputCounter() for name in INPUTS}
         self._settings = settings
         self._calibration = calibration
-        self._limits = ScanLimits(calibration, warn)
+        self._window: SensorWindow | None = None
+        self._limits, self._joiner = ScanLimits(calibration, warn), ScanJoiner()
         if calibration.guesses:
             warn(f"the calibration holds guesses, measure them: {', '.join(calibration.guesses)}")
         self._inputs = set(inputs)
@@ -143,6 +144,15 @@ class Synchronizer:
         self._calibration = self._calibration.with_camera(camera)
         self._absent.add("camera_info")  # not waited for again
 
+    def use_window(self, window: SensorWindow) -> None:
+        """Expect images that show this window of a sensor, if the calibration is that of the sensor."""
+        self._window = window
+
+    @property
+    def awaits_camera(self) -> bool:
+        """Whether the first camera_info has to come before images can be used."""
+        return not self._calibration.image_size[0] and self._awaits("camera_info")
+
     def use_mounting(self, poses: dict[str, Any]) -> None:
         """Replace poses of the sensors, `body_T_camera` or `body_T_lidar` by name."""
         if poses:
@@ -154,6 +164,8 @@ class Synchronizer:
         Raises:
             MessageError: of kind "size" when the calibration is for other images.
         """
+        if name in ("left", "right") and self._window is not None:
+            self._calibration = self._calibration.within(self._window, value.shape[::-1])
         expected = self._calibration.image_size
         if name in ("left", "right") and not expected[0]:
             raise MessageError("camera_info", "image before its camera_info, and no calibration is named")
@@ -197,8 +209,7 @@ class Synchronizer:
 
     def _use(self, one: StampedInput) -> None:
         if one.name == "cloud":
-            key = one.stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
-            self._anchors.append(Anchor(key, one.stamp_ns, self._limits.apply(one.value)))
+            self._await(self._joiner.add(one.stamp_ns, one.value))
         elif one.name == ODOMETRY:
             self._odometry.add(one.stamp_ns, one.value)
             self.counters[one.name].used += 1
@@ -208,8 +219,15 @@ class Synchronizer:
             if one.name == "left" and ("cloud" not in self._inputs or self._is_silent("cloud", one.stamp_ns)):
                 self._anchors.append(Anchor(one.stamp_ns, one.stamp_ns))
 
+    def _await(self, scans: list[Scan]) -> None:
+        """Let frames wait for the other inputs of whole scans."""
+        for scan in scans:
+            key = scan.stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
+            self._anchors.append(Anchor(key, scan.stamp_ns, self._limits.apply(scan.cloud), scan.messages))
+
     def _end_session(self, of_clock: bool = True) -> None:
         """Complete the waiting frames with the data at hand; images are kept where the odometry alone was reset."""
+        self._await(self._joiner.flush())
         while self._anchors:
             self._complete(self._anchors.popleft())
         self._odometry.clear()
@@ -266,20 +284,20 @@ class Synchronizer:
         right = self._right.nearest(left.stamp_ns, STEREO_SLOP_NS) if left else None
         if left is None and not self._left.passed(anchor.stamp_ns):
             self._given_up_ns = anchor.stamp_ns + self._slop_ns
-        if not (self._count_scan(anchor.cloud, left) if anchor.cloud is not None else left):
+        if not (self._count_scan(anchor.cloud, left, anchor.messages) if anchor.cloud is not None else left):
             return
         self._left.use(left)
         self._right.use(right)
         self._frames.append(assemble(anchor, left, right, self._odometry, self._calibration, self.session))
 
-    def _count_scan(self, cloud: Cloud, left: StampedInput | None) -> bool:
+    def _count_scan(self, cloud: Cloud, left: StampedInput | None, messages: int) -> bool:
         """Count a scan as used or dropped; return whether there will be a frame."""
         counter = self.counters["cloud"]
         without_image = left is None and (self._settings.require_image or not len(cloud.points))
         if not len(cloud.points):
-            counter.dropped["empty"] += 1
+            counter.dropped["empty"] += messages
         elif without_image:
-            counter.dropped["no image"] += 1
+            counter.dropped["no image"] += messages
         else:
-            counter.used += 1
+            counter.used += messages
         return not without_image

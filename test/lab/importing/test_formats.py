@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from command_line import only_line, umf
 
 from umf_ros.bags.frames import FrameReader
@@ -18,6 +19,7 @@ from umf_ros.core.config import load_settings
 from umf_ros.core.frames import Frame
 from umf_ros.lab.commands.import_data import KINDS
 from umf_ros.lab.importing import FORMATS
+from umf_ros.sensors.calibration import load_calibration
 
 SIZE = (64, 48)
 COUNT = 5
@@ -233,6 +235,34 @@ def test_tables_that_are_none_are_one_clear_line(tmp_path: Path, table: str, con
 
 def test_eurocs_pair_is_rectified(tmp_path: Path) -> None:
     assert imported("euroc", tmp_path)[0].camera.baseline == pytest.approx(0.2, abs=1e-6)
+
+
+def with_lens(root: Path, camera: str, distortion: str, coefficients: list[float]) -> Path:
+    source = euroc(root)
+    for name in ("cam0", "cam1"):
+        path = source / "mav0" / name / "sensor.yaml"
+        models = f"camera_model: {camera}\ndistortion_model: {distortion}\n"
+        path.write_text(models + path.read_text().replace("[0, 0, 0, 0]", str(coefficients)))
+    return source
+
+
+def test_a_fisheye_of_euroc_stays_one(tmp_path: Path) -> None:
+    """Its coefficients as those of another lens are 42 px wrong at 45 deg."""
+    source = with_lens(tmp_path / "set", "pinhole", "equidistant", [0.0035, 0.0007, -0.002, 0.0002])
+    umf("import", "euroc", source, tmp_path / "made.mcap")
+    left = yaml.safe_load((tmp_path / "made.calibration.yaml").read_text())["raw_camera"]["left"]
+    assert (left["distortion_model"], left["distortion"][0]) == ("equidistant", 0.0035)
+    assert load_calibration(tmp_path / "made.calibration.yaml").camera.baseline == pytest.approx(0.2, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "models", [("omni", "radtan"), ("eucm", "none"), ("ds", "none"), ("pinhole", "fov"), ("pinhole", "field-of-view")]
+)
+def test_lenses_that_cannot_be_rectified_are_named(tmp_path: Path, models: tuple[str, str]) -> None:
+    source = with_lens(tmp_path / "set", *models, [0.1, 0, 0, 0])
+    assert f"the model {'-'.join(models)} cannot be rectified" in only_line(
+        umf("import", "euroc", source, tmp_path / "a.mcap")
+    )
 
 
 def test_an_imported_recording_is_of_no_known_data_set_and_never_overwritten(tmp_path: Path) -> None:
