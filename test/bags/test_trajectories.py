@@ -141,6 +141,12 @@ def test_positions_alone_have_no_orientation_and_are_no_odometry(tail: str, tmp_
         read_odometry(path, "body", load_settings())
 
 
+def test_odometry_of_a_straight_drive_may_have_one_rotation(tmp_path: Path) -> None:
+    straight = [make_pose(np.eye(3), [0.1 * k, 0, 0]) for k in range(30)]
+    write_tum(tmp_path / "a.tum", Trajectory(START_NS + np.arange(30) * S, np.stack(straight)))
+    np.testing.assert_allclose(read_odometry(tmp_path / "a.tum", "body", load_settings()).poses, straight, atol=1e-8)
+
+
 def test_tum_files_that_cannot_be_read_or_written(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="cannot read"):
         read_tum(tmp_path / "nothing.tum")

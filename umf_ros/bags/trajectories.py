@@ -24,8 +24,9 @@ from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose, stamp_ns
 logger = logging.getLogger(__name__)
 KITTI, FEW_POSES, PIECES = 12, 9, 100
 """Numbers in a line of KITTI's poses; poses whose rotation may be equal by chance; pieces of a path, by hand."""
-ALONG, CLEARLY = 0.8, 0.2
-"""Share of the motion along one axis of a rover's body, and by how much a right order of w is better: by hand."""
+ALONG, CLEARLY, CURVED = 0.8, 0.2, 0.05
+"""By hand: share of the motion along one axis of a rover's body, by how much a right order of w is better, and width of
+a path by its length, of one that turns."""
 GPS_EPOCH_S, LEAP_SECONDS = 315_964_800, 18
 """1980-01-06 in POSIX seconds; GPS time is ahead of UTC by this much since 2017."""
 WORST_QUALITY = 2
@@ -130,7 +131,8 @@ def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajector
     if frame not in mountings:
         raise BagError(f"unknown frame {frame!r} of the odometry; expected one of {', '.join(mountings)}")
     found = read_tum(path)
-    if not found.has_orientation and len(found) > 1:
+    sizes_m = np.linalg.svd(found.poses[:, :3, 3] - found.poses[:, :3, 3].mean(axis=0), compute_uv=False)
+    if not found.has_orientation and sizes_m[1:].max(initial=0) > CURVED * sizes_m[0]:
         raise BagError(f"{path} has no rotations (none, or the same in every line): odometry needs them")
     return found.of_body(mountings[frame])
 
