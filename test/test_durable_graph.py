@@ -162,7 +162,7 @@ def test_a_journal_that_holds_nonsense_is_refused_in_one_line(change: str, world
     graph.close()
     with sqlite3.connect(path) as connection:
         connection.execute(change)
-    with pytest.raises(UmfError, match="is damaged|is not that of a pose graph") as refusal:
+    with pytest.raises(UmfError, match=r"is damaged|is not that of a pose graph") as refusal:
         made(path)
     assert "\n" not in str(refusal.value)
 
