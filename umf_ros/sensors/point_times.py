@@ -46,6 +46,7 @@ class PointTimes:
         self._spans, self._periods = deque[float](maxlen=_RECENT), deque[int](maxlen=_RECENT)
         self._before: tuple[int, float] | None = None
 
+    @np.errstate(all="ignore")  # of numbers that are no times
     def offsets_ns(self, times: NDArray[Any], stamp_ns: int) -> NDArray[np.int64] | None:
         """Return (N,) ns from the stamp of the message to the points; None if the times fit no unit.
 

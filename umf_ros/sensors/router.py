@@ -71,7 +71,7 @@ class MessageRouter:
         self._infos: dict[str, tuple[Any, Any]] = {}
         self._said: dict[str, Any] = {}
         self._used: tuple[Any, Any, Any] | None = None
-        self._times, self._grey = PointTimes(lambda text: warn(f"{topics.cloud}: {text}")), GreyRange()
+        self._times, self._grey = PointTimes(lambda text: self._warn(f"{topics.cloud}: {text}")), GreyRange()
         self._early: list[tuple[str, Any]] = []
         self._size: tuple[int, int] | None = None
         self._topics = topics

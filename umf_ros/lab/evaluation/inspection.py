@@ -126,7 +126,7 @@ def _cloud_words(message: Any) -> str:
 def _info_words(message: Any) -> str:
     camera = decode_camera_info(message)
     distorted = np.any(np.asarray(message.d, float))
-    model = f", with distortion ({message.distortion_model})" if distorted else ""
+    model = f", with distortion ({printable(message.distortion_model)})" if distorted else ""
     return f"{camera.width} x {camera.height}, fx {camera.fx:.1f}{model}"
 
 
