@@ -49,22 +49,23 @@ class OdometryDecoder:
         stamp, pose = stamp_ns(message), message.pose.pose
         position, turn = pose.position, pose.orientation
         given = np.array([position.x, position.y, position.z]), np.array([turn.x, turn.y, turn.z, turn.w])
-        is_empty = not self._is_filled[1] and not given[1].any()
+        # without a twist either, a quaternion of zeros says nothing
+        is_told = self._first is not None or _speeds(message).any()
+        is_empty = not self._is_filled[1] and not given[1].any() and is_told
         odom_T_body = make_pose(np.eye(3), given[0]) if is_empty else decode_pose(pose)
         if self._first is None:
             self._first, self._last_ns = given, stamp
             self._start, self._integrated = odom_T_body, odom_T_body.copy()
         if not self._is_filled.all():
             self._is_filled |= [not np.array_equal(a, b) for a, b in zip(given, self._first, strict=True)]
-            odom_T_body = self._complete(message.twist.twist, stamp, odom_T_body)
+            odom_T_body = self._complete(_speeds(message), stamp, odom_T_body)
         self._last_ns = stamp
         return OdometrySample(stamp, odom_T_body)
 
-    def _complete(self, twist: Any, stamp: int, odom_T_body: Array) -> Array:
+    def _complete(self, speeds: Array, stamp: int, odom_T_body: Array) -> Array:
         """Return a pose (4, 4) with its unfilled parts integrated, once the twist says that the body has moved."""
-        speeds = np.array([[getattr(part, axis) for axis in "xyz"] for part in (twist.linear, twist.angular)])
         elapsed_s = (stamp - self._last_ns) * 1e-9
-        steps = np.nan_to_num(speeds) * (elapsed_s if 0 < elapsed_s <= LONGEST_STEP_S else 0.0)
+        steps = speeds * (elapsed_s if 0 < elapsed_s <= LONGEST_STEP_S else 0.0)
         self._moved += np.linalg.norm(steps, axis=1)
         half = expmap(np.hstack([steps[1], steps[0]])[None] / 2)[0]
         self._integrated = self._integrated @ half @ half
@@ -102,3 +103,10 @@ class OdometryDecoder:
             self._corner = position - chord  # the next message is refused too
             text = "the orientation of the odometry is never filled, while its path turns: the odometry is not used"
             raise MessageError("orientation", text)
+
+
+def _speeds(message: Any) -> Array:
+    """Return (2, 3) linear and angular speeds of a message, m/s and rad/s; 0 where they are not finite."""
+    twist = message.twist.twist
+    speeds = np.array([[getattr(part, axis) for axis in "xyz"] for part in (twist.linear, twist.angular)], float)
+    return np.where(np.isfinite(speeds), speeds, 0.0)
