@@ -14,7 +14,7 @@ from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.errors import OutputError
 from umf_ros.core.frames import Embedding, Frame
 from umf_ros.core.geometry import heading, invert, make_pose, relative, rotation_angle, transform
-from umf_ros.detector import NOTHING_METRIC, Detection, LoopDetector
+from umf_ros.detector import NOTHING_METRIC, WITHHELD, Detection, LoopDetector
 from umf_ros.verification import RejectReason
 
 LAP_S = 40
@@ -116,6 +116,28 @@ def test_a_revisit_becomes_a_metric_closure_without_any_network(detections: list
         assert closure.query_stamp_ns - closure.match_stamp_ns >= 20e9
         assert closure.probability >= 0.9
         assert (np.linalg.eigvalsh(closure.covariance) > 0).all()
+
+
+def test_closures_are_withheld_while_the_axes_of_the_odometry_are_impossible(
+    ground: np.ndarray, frames: list[Frame], detections: list[Detection], caplog: pytest.LogCaptureFixture
+) -> None:
+    mirror = np.diag([1.0, -1, 1, 1])
+    first = [
+        replace(frames[0], points=scan_from(ground, pose_at(s), i), odom_T_body=pose_at(s), stamp_ns=round(s * 1e9))
+        for i, s in enumerate(np.arange(0, 8, 0.25))
+    ]
+    truth = {round(second * 1e9): pose_at(second) for second in np.arange(0, 1.5 * LAP_S, 0.25)}
+    drive = [*first, *frames[8:]]
+    mirrored = LoopDetector(load_settings(), TrueEmbedder(truth))
+    spoilt = [
+        replace(one, odom_T_body=mirror @ one.odom_T_body @ mirror) for one in drive if one.odom_T_body is not None
+    ]
+    verdicts = [verdict for one in spoilt for verdict in mirrored.process(one).verdicts]
+    mirrored.close()
+    withheld = [one for one in verdicts if one.reason is RejectReason.SENSORS]
+    assert len(withheld) >= 8 and not any(one.accepted for one in verdicts)
+    assert all("left-handed" in one.outcome for one in withheld)
+    assert sum(WITHHELD in record.message for record in caplog.records) == 1, "said once, before the first closure"
 
 
 def test_the_first_lap_has_nothing_to_close(detections: list[Detection]) -> None:

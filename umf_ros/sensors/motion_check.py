@@ -35,7 +35,7 @@ IMPOSSIBLE_RAD = np.radians(10)  # by hand: errors of right mountings reach 3.3 
 EVIDENCE = 10.0  # by hand: least log-likelihood ratio, nats, of wrong axes to all that are right within this angle
 RELATED = 0.5  # by hand: largest median misfit over the median size of rotations or directions that are related
 UNTURNED_RAD = 0.2  # by hand: rotation by the sensor while the odometry's orientation is constant
-MAX_CLIMB_PX, CLIMB_PX = 20.0, 0.2  # by hand: largest vertical shift of a stereo pair, and noise of it
+MAX_CLIMB_PX, CLIMB_PX = 20.0, 0.2  # by hand: largest vertical shift of a stereo pair, and least noise of it
 MEDIAN_OF_THREE = 1.538  # median length of a vector of three standard normal numbers
 
 MeasuredScan = tuple[small_gicp.PointCloud, small_gicp.KdTree, int]
@@ -190,7 +190,8 @@ def _delay(climb: Array, stereo: Array, waited_s: float) -> Array | None:
     rate, height, weights = climb[kept] / waited_s, stereo[kept, 1], np.ones(kept.sum())
     for _ in range(ROUNDS):
         delay, offset = np.polyfit(rate, height, 1, w=np.sqrt(weights))
-        weights = 1 / (1 + ((height - delay * rate - offset) / CLIMB_PX) ** 2)
+        misfits = np.abs(height - delay * rate - offset)
+        weights = 1 / (1 + (misfits / max(float(np.median(misfits)), CLIMB_PX)) ** 2)
     return np.array([delay, weights @ (rate - rate.mean()) ** 2])
 
 

@@ -186,7 +186,7 @@ def find_contradictions(seen: SensorReport, impossible: bool = True) -> list[Con
         off = {"odometry": odometry}
     found = [_describe(name, one, seen.mountings.get(name)) for name, one in off.items()]
     if late_s := seen.right_delay_s:
-        what = f"right images were exposed about {abs(late_s):.2f} s {'after' if late_s > 0 else 'before'} left ones"
+        what = f"right images were exposed at least {abs(late_s):.2f} s {'after' if late_s > 0 else 'before'} left ones"
         remedy = "correct trigger or pairing in the camera's driver: stereo depth is wrong"
         found.append(Contradiction("camera", f"{what} of the same stamp", remedy))
     return found
