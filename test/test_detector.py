@@ -137,7 +137,8 @@ def test_closures_are_withheld_while_the_axes_of_the_odometry_are_impossible(
     withheld = [one for one in verdicts if one.reason is RejectReason.SENSORS]
     assert len(withheld) >= 8 and not any(one.accepted for one in verdicts)
     assert all("left-handed" in one.outcome for one in withheld)
-    assert sum(WITHHELD in record.message for record in caplog.records) == 1, "said once, before the first closure"
+    said = [record.message for record in caplog.records if WITHHELD in record.message]
+    assert 1 <= len(said) <= 2, "said once for each suspect"
 
 
 def test_the_first_lap_has_nothing_to_close(detections: list[Detection]) -> None:
