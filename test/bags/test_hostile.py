@@ -201,13 +201,17 @@ def test_messages_that_a_killed_recorder_left_in_a_log_are_told(tmp_path: Path) 
         assert f"{path.name}-wal holds messages that are not read" in open_bag(killed).warning
 
 
-def test_metadata_of_another_kind_is_one_line(tmp_path: Path) -> None:
+def test_metadata_of_another_kind_is_not_needed_and_alone_one_line(tmp_path: Path) -> None:
     folder = write_db3(tmp_path / "b", ENTRIES)
+    alone = tmp_path / "alone"
+    alone.mkdir()
     for text in ("- 1\n", "rosbag2_bagfile_information: 3\n", "\xff\xfe", "rosbag2_bagfile_information: {version: []}"):
         copy = tmp_path / "copy"
         shutil.copytree(folder, copy)
         (copy / "metadata.yaml").write_text(text, encoding="latin1")
+        shutil.copy(copy / "metadata.yaml", alone)
+        assert sum(one.count for one in open_bag(copy).topics.values()) == len(ENTRIES)
         with pytest.raises(BagError) as caught:
-            read(copy, tmp_path)
+            read(alone, tmp_path)
         assert "\n" not in str(caught.value)
         shutil.rmtree(copy)

@@ -27,8 +27,8 @@ def secret(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_administrator_sets_a_server_up_and_lets_a_rover_in(
     server: PostgresServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert umf("fleet", "setup", server.address()).out == "the tables have version 1, before 0\n"
-    assert umf("fleet", "setup", server.address()).out == "the tables have version 1, as before\n"
+    assert umf("fleet", "setup", server.address()).out == "the tables have version 2, before 0\n"
+    assert umf("fleet", "setup", server.address()).out == "the tables have version 2, as before\n"
     for said in ("first word\n", "second word\n"):
         monkeypatch.setattr(sys, "stdin", io.StringIO(said))
         assert umf("fleet", "add", server.address(), "ada").status == 0

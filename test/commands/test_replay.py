@@ -207,7 +207,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["{blind}", "--embedder", "netvlad"], "netvlad reads images alone, and {blind} has none"),
         (["{bag}", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
         (["{bag}", "--weights", "{notes}"], "notes.txt"),
-        (["{bag}", "--odometry", "{notes}"], "line 1: expected numbers"),
+        (["{bag}", "--odometry", "{notes}"], "line 1: expected 8 numbers"),
         (["{bag}", "--odometry", "{early}"], "the odometry file covers none of the recording"),
         (
             ["{bag}", "--odometry-frame", "camera"],

@@ -116,12 +116,12 @@ def test_no_pose_is_told_of_odometry_that_the_correction_is_not_of(node: Back, m
     hear(0.5, 1.0, 500.0, 1.5)
     assert told == [0.5, 1.0, 1.5]
     node._worker.submit(gate.wait)
-    hear(500.0, 500.5, 501.0)
+    hear(500.0, 500.5, 501.0, 501.5)
     assert told == [0.5, 1.0, 1.5]
     gate.set()
     assert wait_until(lambda: node._corrected == 1)
-    hear(501.5)
-    assert told == [0.5, 1.0, 1.5, 501.5]
+    hear(502.0)
+    assert told == [0.5, 1.0, 1.5, 502.0]
 
 
 def position(message: PoseWithCovarianceStamped) -> float:

@@ -254,6 +254,7 @@ class WorkerSettings(Group):
     """Worker thread of the live node."""
 
     queue_size: int = Field(10, ge=1, le=1000, description="frames queued at most; the oldest is dropped and counted")
+    finish_s: float = Field(2.0, ge=0, le=60, description="time at shutdown to process frames that wait [s]")
 
 
 class Settings(Group):

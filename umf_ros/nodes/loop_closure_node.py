@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 
 # messages between the executor and the intake: about five seconds of stereo at 30 Hz
 INTAKE_QUEUE = 400
-DECODE_S, DETECT_S = 0.5, 2.0
-"""Longest time for waiting messages and frames at the end, and as long again for the one in hand: 5 s in all."""
+DECODE_S = 0.5
+"""Longest time at the end for waiting messages, and as long again for the one in hand."""
 RESUME = "played again into a node with the same results_dir and database.path, they continue the run"
 SCAN_DEPTH = 50
 MESSAGE_TYPES = {"cloud": PointCloud2, "odometry": Odometry}
@@ -109,7 +109,7 @@ class LoopClosureNode(BaseNode):
         self._decoder.close(timeout_s=DECODE_S)
         for frame in self._synchronizer.flush():
             self._worker.submit(frame)
-        self._worker.close(timeout_s=DETECT_S)
+        self._worker.close(timeout_s=self._settings.worker.finish_s)
         if left := self._worker.dropped + self._decoder.dropped - dropped:
             since = f"after stamp {last.frame_stamp_ns * 1e-9:.3f} s" if last else "from the first one on"
             self.get_logger().warning(f"{left} waiting messages and frames were not processed: {since}; {RESUME}")

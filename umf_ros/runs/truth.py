@@ -241,7 +241,7 @@ def clock_offset(odometry: Trajectory | None, truth: Trajectory) -> float:
     # laps repeat the distances: of equal offsets the smallest
     best = int(np.ma.argmin(costs * (1 + 0.01 * np.abs(LAGS_S))))
     both = differences[[best, len(LAGS_S) // 2]]
-    moved, unmoved = np.ma.compress_cols(both).sum(axis=1)
+    moved, unmoved = both[:, ~np.ma.getmaskarray(both).any(axis=0)].sum(axis=1)
     clear = moved < BETTER * unmoved and costs[best] < CONTRAST * np.ma.median(costs)
     return float(LAGS_S[best]) if clear and abs(LAGS_S[best]) >= LEAST_OFFSET_S else 0.0
 

@@ -193,7 +193,7 @@ FASTEST_NS, PACKETS_NS, GAP = 20_000_000, 100_000_000, 3
 """Shortest period of whole scans, length of a scan of packets, and longest gap in a scan in periods (*by hand*)."""
 
 
-class Scan(NamedTuple):
+class WholeScan(NamedTuple):
     """A whole scan: the stamp of its first message, its returns, and the number of its messages."""
 
     stamp_ns: int
@@ -213,19 +213,19 @@ class ScanJoiner:
         self._kind: Literal["", "whole", "parts", "packets"] = ""
         self._period_ns = 0
 
-    def add(self, stamp_ns: int, cloud: Cloud) -> list[Scan]:
+    def add(self, stamp_ns: int, cloud: Cloud) -> list[WholeScan]:
         """Take the next message; return the scans that are known to be whole by now."""
         if self._kind == "whole" or (not self._kind and len(cloud.points) < FEW):
-            return [Scan(stamp_ns, cloud)]
+            return [WholeScan(stamp_ns, cloud)]
         part = stamp_ns, cloud, _directions(cloud)
         undecided = not self._kind
         done = self.flush() if not undecided and self._parts and self._begins(stamp_ns, part[2]) else []
         self._parts.append(part)
         if undecided:
             self._decide()
-        return [Scan(stamp_ns, cloud)] if undecided else done
+        return [WholeScan(stamp_ns, cloud)] if undecided else done
 
-    def flush(self) -> list[Scan]:
+    def flush(self) -> list[WholeScan]:
         """Return the scan whose parts wait, at the end of a session."""
         parts, self._parts = self._parts if self._kind else [], []
         return [_join(parts)] if parts else []
@@ -267,7 +267,7 @@ def _overlap(one: Mask, other: Mask) -> float:
     return int((one & other).sum()) / max(1, min(int(one.sum()), int(other.sum())))
 
 
-def _join(parts: Sequence[tuple[int, Cloud, Mask]]) -> Scan:
+def _join(parts: Sequence[tuple[int, Cloud, Mask]]) -> WholeScan:
     first_ns, points = parts[0][0], np.concatenate([cloud.points for _, cloud, _ in parts])
     strengths = [cloud.intensity for _, cloud, _ in parts if cloud.intensity is not None]
     offsets = [
@@ -275,7 +275,7 @@ def _join(parts: Sequence[tuple[int, Cloud, Mask]]) -> Scan:
         for stamp_ns, cloud, _ in parts
     ]
     intensity = np.concatenate(strengths) if len(strengths) == len(parts) else None
-    return Scan(first_ns, Cloud(points, intensity, np.concatenate(offsets)), len(parts))
+    return WholeScan(first_ns, Cloud(points, intensity, np.concatenate(offsets)), len(parts))
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.errors import MessageError
 from umf_ros.core.geometry import Array, expmap, make_pose
 from umf_ros.sensors.decode import OdometrySample, decode_pose, stamp_ns
 
@@ -16,16 +15,12 @@ MOVED = np.array([0.25, 0.1])
 """Motion by the twist, m and rad, after which a position or an orientation that is still the first one to the bit was
 never filled (*by hand*: above the resolution of any odometry)."""
 LONGEST_STEP_S = 1.0
-CHORD_M = 1.0
-TURNED_RAD = 0.8
-"""Change of direction of a path of chords beyond which an orientation must have changed (*by hand*)."""
 
 
 class OdometryDecoder:
     """Decoder of nav_msgs/Odometry of one source.
 
-    The twist is integrated in place of a position or an orientation that is never filled. Messages with positions, but
-    with neither an orientation nor a twist, are refused once the path has turned.
+    The twist is integrated in place of a position or an orientation that is never filled.
     """
 
     def __init__(self, warn: Callable[[str], None]) -> None:
@@ -37,15 +32,9 @@ class OdometryDecoder:
         self._start: Array = np.eye(4)
         self._integrated: Array = np.eye(4)
         self._turn: Array = np.eye(3)
-        self._corner: Array | None = None
-        self._direction: Array | None = None
 
     def decode(self, message: Any) -> OdometrySample:
-        """Return the pose of a message.
-
-        Raises:
-            MessageError: as `decode_pose`, or of kind "orientation": it is never filled.
-        """
+        """Return the pose of a message (raises as `decode_pose`)."""
         stamp, pose = stamp_ns(message), message.pose.pose
         position, turn = pose.position, pose.orientation
         given = np.array([position.x, position.y, position.z]), np.array([turn.x, turn.y, turn.z, turn.w])
@@ -85,24 +74,7 @@ class OdometryDecoder:
             self._integrated[:3, :3] = odom_T_body[:3, :3] if self._is_filled[1] else self._integrated[:3, :3]
         if self._is_missing[0]:
             odom_T_body[:3, 3] = self._integrated[:3, 3]
-        if self._is_filled[0] and not self._is_filled[1] and not self._is_missing[1]:
-            self._check_path(odom_T_body[:3, 3])
         return odom_T_body
-
-    def _check_path(self, position: Array) -> None:
-        """Refuse an orientation that stays the first one where the path of positions (3,) turns."""
-        if self._corner is None:
-            self._corner = position
-        chord = position - self._corner
-        if (length_m := float(np.linalg.norm(chord))) < CHORD_M:
-            return
-        direction, self._corner = chord / length_m, position
-        if self._direction is None:
-            self._direction = direction
-        if float(direction @ self._direction) < np.cos(TURNED_RAD):
-            self._corner = position - chord  # the next message is refused too
-            text = "the orientation of the odometry is never filled, while its path turns: the odometry is not used"
-            raise MessageError("orientation", text)
 
 
 def _speeds(message: Any) -> Array:

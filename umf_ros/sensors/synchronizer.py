@@ -11,7 +11,7 @@ from typing import Any
 from umf_ros.core.config import Sync
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import Frame, StereoCamera
-from umf_ros.sensors.assembly import Anchor, OdometryBuffer, Scan, ScanJoiner, ScanLimits, assemble
+from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanJoiner, ScanLimits, WholeScan, assemble
 from umf_ros.sensors.calibration import Calibration, SensorWindow
 from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.sessions import ODOMETRY, Input, SessionClock, StampedInput
@@ -219,7 +219,7 @@ class Synchronizer:
             if one.name == "left" and ("cloud" not in self._inputs or self._is_silent("cloud", one.stamp_ns)):
                 self._anchors.append(Anchor(one.stamp_ns, one.stamp_ns))
 
-    def _await(self, scans: list[Scan]) -> None:
+    def _await(self, scans: list[WholeScan]) -> None:
         """Let frames wait for the other inputs of whole scans."""
         for scan in scans:
             key = scan.stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)

@@ -16,6 +16,7 @@ from umf_ros.core.config import Verification
 from umf_ros.core.errors import CalibrationError, ConfigError, UmfError
 from umf_ros.core.frames import Embedding, Frame
 from umf_ros.core.geometry import invert, make_pose, relative, transform
+from umf_ros.core.trajectory import Trajectory
 from umf_ros.lab.evaluation import place_views
 from umf_ros.lab.evaluation.comparison import Comparer, judge
 from umf_ros.lab.evaluation.place_views import PlaceView, ViewReader
@@ -163,12 +164,14 @@ def recorded(path: Path, outing: Drive, with_odometry: bool) -> Path:
     body_T_lidar = make_pose([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], [0.2, 0.0, 0.6])
     entries = []
     for one in outing.keyframes:
-        assert one.odom_T_body is not None
         stamp = START_NS + one.stamp_ns
         records = scan(transform(invert(body_T_lidar), one.points.astype(float)))
         entries += [(CLOUD, stamp + 2_000_000, cloud(stamp, records))]
-        for moment in (stamp - 10_000_000, stamp, stamp + 10_000_000) if with_odometry else ():
-            entries += [(ODOMETRY, moment + 1_000_000, odometry(moment, one.odom_T_body))]
+    if with_odometry:
+        odom = Trajectory.rising((START_NS + one.stamp_ns, one.odom_T_body) for one in outing.keyframes)
+        moments = np.arange(odom.stamps_ns[0], odom.stamps_ns[-1] + 1, 50_000_000)
+        for moment, pose in zip(moments.tolist(), odom.at(moments, np.inf)[0], strict=True):
+            entries += [(ODOMETRY, moment + 1_000_000, odometry(moment, pose))]
     return write_mcap(path, sorted(entries, key=lambda entry: entry[1]))
 
 

@@ -27,6 +27,7 @@ READY, WAITING = "ready", "waiting for topics"
 PLAYER = "umf_ros.lab.live.bag_player_node"
 NODES = ("umf_ros.nodes.loop_closure_node", "umf_ros.nodes.pose_graph_node")
 # a recording of the simulator must arrive whole, however busy the machine is; its sensors are where its file says
+OFFLINE = ("use_sim_time:=true", "worker.finish_s:=60.0")
 WHOLE = ("dataset:=simulated", "qos.reliability:=reliable", "qos.depth:=200", "frames.extrinsics:=calibration")
 
 
@@ -164,7 +165,7 @@ class LiveGraph:
             raise UmfError(f"the bag player ended with status {player.exit_code}; see {self._folder / 'logs'}")
 
     def _parameters(self) -> list[str]:
-        own = [f"results_dir:={self._folder.resolve()}", "use_sim_time:=true", *([] if self._config else WHOLE)]
+        own = [f"results_dir:={self._folder.resolve()}", *OFFLINE, *([] if self._config else WHOLE)]
         words = [word for text in own for word in ("-p", text)]
         return ["--ros-args", *(["--params-file", str(self._config.resolve())] if self._config else []), *words]
 
