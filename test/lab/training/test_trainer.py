@@ -206,7 +206,7 @@ def test_training_lowers_the_loss(world, folder, tmp_path):
     """Of a batch that is the same before and after: those on the way are not equally hard."""
     torch.manual_seed(0)
     network = UMF(TINY)
-    settings = settings_for(folder, steps=80, weight_local=0, weight_super=0, local_pairs=0, bank=0)
+    settings = settings_for(folder, steps=120, weight_local=0, weight_super=0, local_pairs=0, bank=0)
     objective, batch = MetricObjective(network, settings, list), batch_of(world)
 
     def loss():
