@@ -1,6 +1,7 @@
 """How well the pose graph resists wrong closures, and what it costs.
 
 `python benchmarks/accuracy/pose_graph.py [--quick] [--seed N] [--jobs N] [--json FILE] [FILES.g2o ...]`
+`python benchmarks/accuracy/pose_graph.py --short 20 [--seed N] [--json FILE]`
 
 Generated graphs and, if given, g2o files (their closures count as right) get 0 to 50 % wrong
 closures: far at random, in groups that agree with each other, and as such groups to similar places
@@ -13,6 +14,10 @@ GncLMOptimizer with truncated least squares, odometry as known inliers) [Yang 20
 maximisation (`pcm`, the largest set of pairwise consistent closures, then Levenberg-Marquardt) [Mangelson 2018].
 `gnc_scaled` and `pcm_scaled` multiply the stated covariances by the noise scale that the back-end estimated in the
 same world.
+
+With `--short`, as many drives of one short revisit instead: their odometry is stated as surely as it is, or 3, 10 or 30
+times too surely, and its constant errors are not stated; or it jumps once by 1 or 1.9 m in the middle, between two
+messages. Each runs without wrong closures and with as many groups of near ones.
 """
 
 from __future__ import annotations
@@ -32,7 +37,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.config import PoseGraphSettings
-from umf_ros.core.geometry import Array, adjoint, invert, logmap, propagate
+from umf_ros.core.geometry import Array, adjoint, expmap, invert, logmap, propagate
+from umf_ros.core.trajectory import interpolated
 from umf_ros.lab.datasets.g2o import read_g2o
 from umf_ros.lab.datasets.graph_recording import PERIOD_NS, as_recording
 from umf_ros.lab.simulation.pose_graphs import (
@@ -41,6 +47,7 @@ from umf_ros.lab.simulation.pose_graphs import (
     Kind,
     WorldClosure,
     rover_loops,
+    short_revisit,
     with_bias,
     with_lone_end,
     with_wrong_closures,
@@ -58,6 +65,9 @@ BELIEVING = SETTINGS.model_copy(update={"reject_outliers": False})
 KINDS: tuple[Kind, ...] = ("random", "groups", "near")
 # per metre; a tenth of it is what the stated noise makes of a hundred metres
 BIAS = np.array([0, 0, np.deg2rad(0.1), 0.01, 0, 0])
+SHORT = [(1, 0.0), (3, 0.0), (10, 0.0), (30, 0.0), (1, 1.0), (1, 1.9)]
+"""Short drives: how many times too surely the odometry is stated, and the jump in m."""
+MESSAGES_PER_POSE = 20
 
 
 STATED = NoiseScale()
@@ -419,26 +429,75 @@ def equality(worlds: list[GraphWorld]) -> dict[str, float]:
     return {"batch_equality_mm": 1e3 * max(errors)}
 
 
+def short(first_seed: int, count: int) -> dict[str, float]:
+    """Drives of one short revisit; shares of the right closures accepted and wrong ones accepted of each case."""
+    print(f"{'stated':>7s} {'jump m':>7s} {'wrong':>10s} {'right accepted':>14s} {'all':>5s} {'wrong accepted':>14s}")
+    figures: dict[str, float] = {}
+    for sure, jump_m in SHORT:
+        for share in (0.0, 0.5):
+            accepted, right = [], 0
+            for seed in range(first_seed, first_seed + count):
+                world = short_revisit(seed)
+                world = with_wrong_closures(world, share, "near", seed) if share else world
+                right += sum(closure.right for closure in world.closures)
+                accepted += drive_short(world, sure, jump_m, seed)
+            label = f"{share:.0%} near" if share else "none"
+            wrong = len(accepted) - sum(accepted)
+            print(
+                f"{f'/ {sure}':>7s} {jump_m:7.1f} {label:>10s} {sum(accepted):14d} {right:5d} {wrong:14d}", flush=True
+            )
+            name = f"short_{label.replace('50% ', '')}_stated_{sure}_jump_{jump_m:g}"
+            figures |= {f"{name}_recall": sum(accepted) / right, f"{name}_wrong": float(wrong)}
+    return figures
+
+
+def drive_short(world: GraphWorld, sure: float, jump_m: float, seed: int) -> list[bool]:
+    """Whether each accepted closure is right; messages of odometry come 20 times a pose and state no covariances."""
+    stamps = np.arange(0, (len(world.truth) - 1) * PERIOD_NS + 1, PERIOD_NS // MESSAGES_PER_POSE)
+    poses = interpolated(np.arange(len(world.truth)) * PERIOD_NS, world.odometry, stamps)
+    direction = np.random.default_rng([seed, 5]).uniform(0, 2 * np.pi)
+    jump = expmap(jump_m * np.array([[0, 0, 0, np.cos(direction), np.sin(direction), 0]]))[0]
+    at = len(poses) // 2
+    poses[at:] = poses[at - 1] @ jump @ invert(poses[at - 1]) @ poses[at:]
+    graph = PoseGraph(PoseGraphSettings(odometry_sigma_m=0.05 / sure, odometry_sigma_deg=0.5 / sure))
+    ends = [int(np.searchsorted(stamps, closure.second * PERIOD_NS, side="right")) for closure in world.closures]
+    fed = 0
+    for row, end in enumerate([*ends, len(stamps)]):
+        for k in range(fed, end):
+            graph.add_odometry(int(stamps[k]), poses[k])
+        fed = max(fed, end)
+        if row < len(world.closures):
+            graph.add_closure(world.message(row))
+    graph.settle()
+    return judged(graph, {(c.first * PERIOD_NS, c.second * PERIOD_NS): c.right for c in world.closures})
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", nargs="*", type=Path, help="further g2o files")
     parser.add_argument("--quick", action="store_true", help="fewer and smaller graphs")
+    parser.add_argument("--short", type=int, metavar="N", help="N drives of one short revisit instead")
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help="seed of the first generated graph")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="worlds in parallel")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     arguments = parser.parse_args()
+    figures = short(arguments.seed, arguments.short) if arguments.short else run(arguments)
+    print()
+    for name, value in figures.items():
+        print(f"{name:32s} {value:.4g}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def run(arguments: argparse.Namespace) -> dict[str, float]:
+    """All figures but those of short drives."""
     # the cost first, while no other world is driven
     costs = cost(arguments.seed)
     trials = generated(arguments.seed, arguments.quick)
     files = [from_file(path, arguments.quick) for path in arguments.files]
     print()
     figures = resist(trials + files, arguments.jobs) | costs
-    figures |= equality([trial.world for trial in trials if trial.name.endswith(f"seed {arguments.seed}")])
-    print()
-    for name, value in figures.items():
-        print(f"{name:32s} {value:.4g}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+    return figures | equality([trial.world for trial in trials if trial.name.endswith(f"seed {arguments.seed}")])
 
 
 if __name__ == "__main__":

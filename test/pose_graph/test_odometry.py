@@ -10,7 +10,7 @@ from graph_worlds import SETTINGS
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, adjoint, expmap, invert, propagate, relative
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
-from umf_ros.pose_graph.odometry import OdometryChain
+from umf_ros.pose_graph.odometry import OdometryChain, drift_between
 
 WORLD = rover_loops(300, 12)
 
@@ -76,3 +76,52 @@ def test_standing_still_adds_no_keyframes() -> None:
         chain.add(k * 50_000_000, np.eye(4))
     chain.update()
     assert len(chain.stamps) == 1
+
+
+def driven_chain(poses: Array, period_ns: int = 50_000_000) -> OdometryChain:
+    chain = OdometryChain(PoseGraphSettings())
+    for k, pose in enumerate(poses):
+        chain.add(k * period_ns, pose)
+        chain.update()
+    return chain
+
+
+def end_sigmas(chain: OdometryChain) -> Array:
+    """(6,) standard deviations of the last pose relative to the first by the noise, constant errors left out."""
+    assert chain.span is not None
+    point = chain.at(np.array([chain.span[1]]))
+    return np.sqrt(np.diagonal(propagate(adjoint(invert(point["pose"])), point["noise"])[0]))
+
+
+@pytest.mark.parametrize("jump", [(0, 0, 0, 1.0, 0, 0), (0, 0, 0, 0, 1.9, 0), (0, 0, 0.5, 0, 0, 0)])
+def test_a_step_that_jumps_is_as_uncertain_as_it_is_too_long(jump: tuple[float, ...]) -> None:
+    poses = line(200)
+    smooth = end_sigmas(driven_chain(poses))
+    poses[120:] = poses[119] @ expmap(np.array([jump]))[0] @ invert(poses[119]) @ poses[120:]
+    jumped = end_sigmas(driven_chain(poses))
+    angle, distance = np.linalg.norm(jump[:3]), np.linalg.norm(jump[3:])
+    assert jumped[2] == pytest.approx(np.hypot(smooth[2], angle), rel=0.05)
+    # a turn moves the end of the 8 m after it to the side
+    assert jumped[4] == pytest.approx(np.hypot(smooth[4], distance + 8 * angle), rel=0.1)
+
+
+def test_starts_stops_and_turns_of_a_rover_are_no_jumps() -> None:
+    speed = np.concatenate([np.zeros(40), np.full(40, 2.0), np.zeros(40), np.full(40, -1.5)]) * 0.05
+    rate = np.concatenate([np.zeros(60), np.full(30, 1.5), np.full(70, -1.0)]) * 0.05
+    poses = [np.eye(4)]
+    for forward, turn in zip(speed, rate, strict=True):
+        poses.append(poses[-1] @ expmap(np.array([[0, 0, turn, forward, 0, 0]]))[0])
+    sigmas = end_sigmas(driven_chain(np.array(poses)))
+    assert sigmas[2] < 0.1 and sigmas[3:].max() < 0.3
+
+
+def test_constant_errors_add_up_and_cancel_on_the_way_back() -> None:
+    out = np.array([[0, 0, 0, 0.1, 0, 0]])
+    poses = [np.eye(4)]
+    for k in range(400):
+        poses.append(poses[-1] @ expmap(out if k < 200 else -out)[0])
+    chain = driven_chain(np.array(poses))
+    points = chain.at(np.array([0, 200, 400]) * 50_000_000)
+    far, back = (np.sqrt(np.diagonal(drift_between(points[0], points[k]))) for k in (1, 2))
+    assert far[3] == pytest.approx(0.03 * 20, rel=0.02) and far[2] == pytest.approx(np.deg2rad(0.2 * 20), rel=0.02)
+    assert back[3] == pytest.approx(0, abs=0.02)

@@ -112,15 +112,15 @@ def test_odometry_that_drifted_far_is_overruled_by_enough_places() -> None:
     graph, seen = driven(world), []
     for row in range(len(world.closures)):
         seen.append(states(graph.add_closure(world.message(row))))
-    assert seen[0] == {0: State.REJECTED}
+    assert seen[0] == {0: State.PENDING}  # constant errors explain it
     assert any(State.ACCEPTED in change.values() for change in seen)
     graph.settle()
     assert accepted(graph) == {(c.first, c.second) for c in world.closures}
 
 
 def test_what_was_rejected_comes_back_when_the_map_moves() -> None:
-    world = closing(two_laps(bias=TURN), lap_pairs(0, *range(3, 60, 6)), noise=1.0)
-    graph = driven(world)
+    world = closing(two_laps(bias=4 * TURN), lap_pairs(0, *range(3, 60, 6)), noise=1.0)
+    graph = driven(world, stated=0.1)
     (first,) = graph.add_closure(world.message(0))
     assert first.state is State.REJECTED and "contradicts the map" in first.reason
     for row in range(1, len(world.closures)):
@@ -134,7 +134,7 @@ def test_closures_near_the_moved_map_are_compared_again() -> None:
     graph = driven(world, stated=2.0)
     for row in range(len(world.closures)):
         graph.add_closure(world.message(row))
-    assert State.REJECTED in {verdict.state for verdict in graph.closures()}
+    assert graph.verdict_counts()[State.ACCEPTED] < len(world.closures)
     for _ in range(4):
         graph.update()
     assert accepted(graph) == {(c.first, c.second) for c in world.closures}

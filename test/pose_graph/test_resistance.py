@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 from graph_worlds import SETTINGS, accepted, batch_optimum, drive, feed_odometry, right, rms
 
+from umf_ros.core.config import PoseGraphSettings
+from umf_ros.core.geometry import expmap, invert
+from umf_ros.core.trajectory import interpolated
 from umf_ros.lab.simulation.pose_graphs import (
+    PERIOD_NS,
     GraphWorld,
     Kind,
     garage,
     rover_loops,
+    short_revisit,
     sphere,
     with_bias,
     with_lone_end,
@@ -130,3 +135,35 @@ def test_a_wrong_set_of_few_places_overrules_nothing() -> None:
 def test_a_lone_closure_at_the_end_is_accepted_among_wrong_ones() -> None:
     world = with_wrong_closures(with_lone_end(rover_loops(400, 20000)), 0.5, "near", 1)
     assert accepted(drive(world)) == right(world)
+
+
+@pytest.mark.parametrize("sure", [1, 3, 10, 30])
+def test_one_short_revisit_closes_however_surely_the_odometry_is_stated(sure: int) -> None:
+    # constant errors of heading and scale, which the stated noise leaves out, and one place to see them by
+    world = short_revisit(10101)
+    assert accepted(drive(world, stated=1 / sure)) == right(world)
+
+
+@pytest.mark.parametrize("seed", [10200, 10201, 10203])
+def test_aliases_near_one_short_revisit_stay_out(seed: int) -> None:
+    world = with_wrong_closures(short_revisit(seed), 0.5, "near", seed)
+    assert accepted(drive(world)) <= right(world)
+
+
+@pytest.mark.parametrize("jump_m", [1.0, 1.9])
+def test_odometry_that_jumps_once_between_two_messages(jump_m: float) -> None:
+    world = short_revisit(10102)
+    stamps = np.arange(0, (len(world.truth) - 1) * PERIOD_NS + 1, PERIOD_NS // 20)
+    poses = interpolated(np.arange(len(world.truth)) * PERIOD_NS, world.odometry, stamps)
+    at, jump = len(poses) // 2, expmap(np.array([[0, 0, 0, 0, jump_m, 0]]))[0]
+    poses[at:] = poses[at - 1] @ jump @ invert(poses[at - 1]) @ poses[at:]
+    graph = PoseGraph(PoseGraphSettings())
+    for stamp, pose in zip(stamps.tolist(), poses, strict=True):
+        graph.add_odometry(stamp, pose)
+    for row in range(len(world.closures)):
+        graph.add_closure(world.message(row))
+    graph.settle()
+    assert accepted(graph) == right(world)
+    ends, truth = graph.poses_at(np.array([0, len(world.truth) - 1]) * PERIOD_NS)[0], world.truth[[0, -1]]
+    miss = invert(invert(truth[0]) @ truth[1]) @ invert(ends[0]) @ ends[1]
+    assert np.linalg.norm(miss[:3, 3]) < 0.3

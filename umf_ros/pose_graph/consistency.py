@@ -24,12 +24,14 @@ from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.geometry import Array, adjoint, invert, logmap, propagate
 from umf_ros.core.table import Table
 from umf_ros.pose_graph.closures import CLOSURE, Closures
-from umf_ros.pose_graph.odometry import Rows, noise_between
+from umf_ros.pose_graph.odometry import Rows, drift_covariance, noise_between
 
 Loops = NDArray[np.void]
-LOOP = np.dtype([("residual", "f8", 6), ("odometry", "f8", (6, 6)), ("closures", "f8", (6, 6))])
-"""Fields of `Loops`: residual of a loop, and its covariances by the stated noise of odometry and
-of closures."""
+LOOP = np.dtype(
+    [("residual", "f8", 6), ("odometry", "f8", (6, 6)), ("closures", "f8", (6, 6)), ("drift", "f8", (6, 6))]
+)
+"""Fields of `Loops`: residual of a loop, and its covariances by the stated noise of odometry and of closures, and by
+constant errors of the odometry."""
 _MOST_COMPARED = 40
 _DEGREES = 6
 # nats: where one place is mistaken for another, the next place is too with more than chance probability
@@ -45,6 +47,9 @@ _TOLERANCE = np.log(1.8)
 _SAME_UNITS = np.log(4.0)
 # the first loops are too short to show drift, unless all noise is stated in other units
 _LEAST_ODOMETRY = 0.3
+# nats below the likeliest factor that are still plausible
+_PLAUSIBLE = 2.0
+_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -64,23 +69,26 @@ def squared_mahalanobis(twists: Array, covariances: Array) -> Array:
     return np.einsum("...i,...i->...", twists, np.linalg.solve(covariances, twists[..., None])[..., 0])
 
 
-def false_alarm_probability(covariances: Array, settings: PoseGraphSettings) -> Array:
-    """Return the share (N,) of wrong closures that pass for right ones under predicted covariances (N, 6, 6)."""
+def false_alarm_ratio(covariances: Array, settings: PoseGraphSettings) -> Array:
+    """Return the share (N,) of wrong closures that pass for right ones under predicted covariances (N, 6, 6).
+
+    It is above one where the predicted area is larger than that of the wrong closures.
+    """
     spreads = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[..., 3:, 3:])[..., 1:], 0.0))
-    return np.minimum(settings.gate_chi2 * spreads.prod(axis=-1) / settings.alias_radius_m**2, 1.0)
+    return np.asarray(settings.gate_chi2 * spreads.prod(axis=-1) / settings.alias_radius_m**2)
 
 
 def likelihood_ratio(false_alarms: Array, distances: Array, settings: PoseGraphSettings) -> Array:
-    """Return the likelihood ratios (N,) of distances from predictions, wrong over right closures; one at most.
+    """Return the likelihood ratios (N,) of distances from predictions, wrong over right closures.
 
     Args:
-        false_alarms: (N,) false-alarm probabilities of the predictions.
+        false_alarms: (N,) false-alarm ratios of the predictions.
         distances: (N,) squared Mahalanobis distances from them; those below that of most right closures count alike.
         settings: of the pose graph.
     """
     rising = np.maximum(distances, _DEGREES - 2)
     right = rising**2 * np.exp(-rising / 2) / 16  # density of a chi-square of six degrees of freedom
-    return np.minimum(false_alarms / settings.gate_chi2 / np.maximum(right, 1e-12), 1.0)
+    return np.asarray(false_alarms / settings.gate_chi2 / np.maximum(right, 1e-12))
 
 
 def loops_between(one: Closures, others: Closures) -> Loops:
@@ -99,6 +107,12 @@ def loops_between(one: Closures, others: Closures) -> Loops:
     loops["residual"] = logmap(one["pose"] @ after_one)
     loops["odometry"] = propagate(adjoint(invert(after_query)), walked_query) + walked_match
     loops["closures"] = propagate(adjoint(invert(after_one)), one["covariance"]) + other_noise
+    to_query = adjoint(invert(after_query) @ invert(others["query"]["pose"]))
+    to_match = adjoint(invert(one["match"]["pose"]))
+    # a second drive along the same way has the same constant error: the difference of both counts
+    walked = to_query @ (others["query"]["drift"] - one["query"]["drift"])
+    walked += to_match @ (one["match"]["drift"] - others["match"]["drift"])
+    loops["drift"] = drift_covariance(walked)
     return loops
 
 
@@ -191,10 +205,10 @@ class ConsistencyGraph:
         self._consistent.append({})
         self._inconsistent.append(set())
         loops = loops_between(one, self.closures[near])
-        covariances = self.scale.covariances(loops["odometry"], loops["closures"])
+        covariances = self.scale.covariances(loops["odometry"], loops["closures"]) + loops["drift"]
         distances = squared_mahalanobis(loops["residual"], covariances)
-        false_alarms = false_alarm_probability(covariances, self.settings)
-        ratios = likelihood_ratio(false_alarms, distances, self.settings)
+        false_alarms = false_alarm_ratio(covariances, self.settings)
+        ratios = np.minimum(likelihood_ratio(false_alarms, distances, self.settings), 1.0)
         for other, distance, false_alarm, ratio in zip(near.tolist(), distances, false_alarms, ratios, strict=True):
             if false_alarm >= 1:  # any closure would pass
                 continue
@@ -226,7 +240,9 @@ class NoiseScaleEstimator:
         logs = np.log(_GRID)
         # one decade off is two sigmas: a few loops cannot move a stated covariance
         self._likelihood = -0.5 * ((logs[:, None] / 1.15) ** 2 + (logs[None, :] / 1.15) ** 2)
-        self._of_axis = np.stack([self._likelihood] * _DEGREES)
+        self._prior = self._of_axis = np.stack([self._likelihood] * _DEGREES)
+        self._spread: list[Loops] = []
+        self._factors = len(logs) // 2, len(logs) // 2  # with which loops are weighted
         self._of_place: dict[int, Array] = {}
         self.loops = 0
 
@@ -242,11 +258,17 @@ class NoiseScaleEstimator:
         self._of_place[place] = self._of_place.get(place, 0.0) + new
         self._likelihood = self._likelihood + new
         self.loops += len(latest)
-        # a loop counts for single axes as far as all together take it for right, by the stated noise at least
+        # a loop counts for single axes as far as all together take it for right, by the stated noise at least: the
+        # first loops may all be wrong, so that all are weighted again when the likeliest factors change
         odometry, closures = divmod(int(np.argmax(self._likelihood)), len(_GRID))
-        right, wrong = _likelihoods(spread)
-        weights = expit(right - wrong)[:, max(odometry, len(_GRID) // 2), closures]
-        self._of_axis += np.tensordot(weights, _likelihoods_by_axis(spread), axes=1)
+        factors = max(odometry, len(_GRID) // 2), closures
+        self._spread.append(spread)
+        if factors != self._factors:
+            self._factors, spread, self._of_axis = factors, np.concatenate(self._spread), self._prior
+        for part in np.array_split(spread, len(spread) // _AT_ONCE + 1):
+            right, wrong = _likelihoods(part)
+            weights = expit(right - wrong)[:, *factors]
+            self._of_axis = self._of_axis + np.tensordot(weights, _likelihoods_by_axis(part), axes=1)
 
     @property
     def scale(self) -> NoiseScale:
@@ -273,6 +295,12 @@ class NoiseScaleEstimator:
         closures_factor = _significant(closures_factor)
         least = _LEAST_ODOMETRY * min(closures_factor, 1.0)
         return NoiseScale(max(_significant(odometry_factor), least), closures_factor)
+
+    @property
+    def widest(self) -> float:
+        """The largest factor of odometry that the loops do not exclude, by two standard deviations."""
+        merit = self._likelihood.max(axis=1)
+        return float(_GRID[np.flatnonzero(merit >= merit.max() - _PLAUSIBLE)[-1]])
 
     def _is_widely_better(self, one: tuple[int, int], other: tuple[int, int]) -> bool:
         """Return whether one choice is better even without the place that favours it most."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from umf_ros.core.config import PoseGraphSettings
@@ -16,7 +17,6 @@ from umf_ros.core.geometry import (
     logmap,
     orthonormal,
     propagate,
-    relative,
     ros_to_gtsam_covariance,
 )
 from umf_ros.core.odometry_noise import OdometryNoise
@@ -27,11 +27,25 @@ Stamps = NDArray[np.int64]
 Rows = NDArray[np.int64]
 PathPoints = NDArray[np.void]
 POINT = np.dtype(
-    [("session", "i8"), ("stamp", "i8"), ("travel", "f8"), ("pose", "f8", (4, 4)), ("noise", "f8", (6, 6))]
+    [
+        ("session", "i8"),
+        ("stamp", "i8"),
+        ("travel", "f8"),
+        ("pose", "f8", (4, 4)),
+        ("noise", "f8", (6, 6)),
+        ("drift", "f8", (6, 2)),
+    ]
 )
 """Fields of `PathPoints`, the odometry at some stamps: session, stamp in ns, path length in m since its start, pose,
-and the noise of all steps so far. Pose and noise are seen from the session's first position, so that sums stay well
-conditioned."""
+the noise of all steps so far, and the twist of a constant error of heading (rad/m) and of scale. Pose, noise and drift
+are seen from the session's first position, so that sums stay well conditioned."""
+# by hand: standard deviations of the constant errors of a rover's odometry, which no covariance states: heading, rad/m,
+# and scale (wheels that slip in sand, a track width or a stereo baseline that is wrong)
+_DRIFT_SIGMAS = np.array([np.deg2rad(0.2), 0.03])
+# by hand: a step is a jump if it exceeds the speed of the steps before by as much again, an acceleration (rad/s^2,
+# m/s^2) during it, and this (rad, m)
+_JUMP, _ACCELERATION = np.array([np.deg2rad(5.0), 0.3]), np.array([np.deg2rad(300.0), 5.0])
+_STEPS_BEFORE = 9
 
 
 def noise_between(a: PathPoints, b: PathPoints) -> Array:
@@ -40,12 +54,24 @@ def noise_between(a: PathPoints, b: PathPoints) -> Array:
     return np.where(forward, 1.0, -1.0) * (b["noise"] - a["noise"])
 
 
+def drift_between(a: PathPoints, b: PathPoints) -> Array:
+    """Return (..., 6, 6) covariance of the constant errors of the odometry between points, at the origin of both."""
+    return drift_covariance(b["drift"] - a["drift"])
+
+
+def drift_covariance(twists: Array) -> Array:
+    """Return (..., 6, 6) covariances of (..., 6, 2) twists of constant errors of heading and scale."""
+    scaled = twists * _DRIFT_SIGMAS
+    return np.asarray(scaled @ np.swapaxes(scaled, -1, -2))
+
+
 class OdometryChain:
     """All messages of one session, and keyframes among them with the accumulated noise.
 
     The noise of the path from a to b is a difference of prefix sums: with `W` the covariance of a
     step carried to the origin by the adjoint, `cov(a_T_b) = Ad(b)^-1 (sum_b W - sum_a W) Ad(b)^-T`
-    in the tangent space of b. So any two stamps of a session are compared in constant time.
+    in the tangent space of b. So any two stamps of a session are compared in constant time. The same holds for the
+    twist of constant errors. A step that jumps, as where a filter took a GNSS fix, is as uncertain as it is too long.
     """
 
     def __init__(self, settings: PoseGraphSettings, session: int = 0) -> None:
@@ -55,7 +81,9 @@ class OdometryChain:
         self._covariances: dict[int, Array] = {}
         stamps, poses = np.empty(0, np.int64), np.empty((0, 4, 4))
         self._messages = Table(stamp=stamps, pose=poses)
-        self._keyframes = Table(stamp=stamps, pose=poses, travel=np.empty(0), noise=np.empty((0, 6, 6)))
+        self._keyframes = Table(
+            stamp=stamps, pose=poses, travel=np.empty(0), noise=np.empty((0, 6, 6)), drift=np.empty((0, 6, 2))
+        )
 
     @property
     def stamps(self) -> Stamps:
@@ -111,13 +139,15 @@ class OdometryChain:
 
     def at(self, stamps: Stamps) -> PathPoints:
         """Return the path (N,) at stamps that the odometry covers."""
-        poses, travel, collected = self.poses_at(stamps), self._keyframes["travel"], self._keyframes["noise"]
+        poses, travel = self.poses_at(stamps), self._keyframes["travel"]
         lower, upper, share = bracket(self.stamps, stamps)
         points = np.zeros(len(stamps), POINT)
         points["session"], points["stamp"], points["pose"] = self._session, stamps, self._from_origin(poses)
         points["travel"] = (1 - share) * travel[lower] + share * travel[upper]
         shares = share[:, None, None]
-        points["noise"] = (1 - shares) * collected[lower] + shares * collected[upper]
+        for name in ("noise", "drift"):
+            collected = self._keyframes[name]
+            points[name] = (1 - shares) * collected[lower] + shares * collected[upper]
         beyond = stamps > self.stamps[-1]
         if beyond.any():
             last = np.broadcast_to(self.poses[-1], poses[beyond].shape)
@@ -166,17 +196,45 @@ class OdometryChain:
         keep = given[rows] | (np.diff(np.floor(travel / self._settings.keyframe_spacing_m), prepend=-1) > 0)
         keep[0] = not known
         if keep.any():
-            self._add_keyframes(stamps[keep], np.concatenate([poses[:1], poses[keep]]), travel[keep], travel[0])
+            jumped = np.cumsum(self._find_jumps(start) ** 2, axis=0)[np.concatenate([rows[:1], rows[keep]])]
+            self._add_keyframes(
+                stamps[keep], np.concatenate([poses[:1], poses[keep]]), travel[keep], travel[0], np.diff(jumped, axis=0)
+            )
 
-    def _add_keyframes(self, stamps: Stamps, poses: Array, travel: Array, start: float) -> None:
-        """Add N keyframes; `poses` begins with the one before the first, `start` is the path length up to that."""
+    def _find_jumps(self, start: int) -> Array:
+        """Return (M, 2) excess, rad and m, of the steps that jump and end at messages after `start`; 0 for others.
+
+        The speed of a step is compared with the median of those before, so that later messages do not change it.
+        """
+        first = max(start - _STEPS_BEFORE, 0)
+        stamps, poses = self._messages["stamp"][first:], self._messages["pose"][first:]
+        excess = np.zeros((len(stamps), 2))
+        if len(stamps) > _STEPS_BEFORE + 1:
+            seconds = np.diff(stamps)[:, None] / 1e9
+            lengths = np.linalg.norm(logmap(invert(poses[:-1]) @ poses[1:]).reshape(-1, 2, 3), axis=2)
+            before = sliding_window_view((lengths / seconds)[:-1], _STEPS_BEFORE, axis=0)
+            usual = np.median(before, axis=2) * seconds[_STEPS_BEFORE:]
+            too_long = lengths[_STEPS_BEFORE:] - usual
+            limits = _JUMP + usual + _ACCELERATION * seconds[_STEPS_BEFORE:] ** 2
+            excess[_STEPS_BEFORE + 1 :] = np.where(too_long > limits, too_long, 0.0)
+        excess[: start - first + 1] = 0.0  # known before
+        return excess[start - first :]
+
+    def _add_keyframes(self, stamps: Stamps, poses: Array, travel: Array, start: float, jumped: Array) -> None:
+        """Add N keyframes after `poses[0]`, up to which the path length is `start`; (N, 2) `jumped`, rad^2 and m^2."""
         steps = self._noise.covariances(np.diff(travel, prepend=start))
+        moved = invert(poses[:-1]) @ poses[1:]
         for row in np.flatnonzero(self._has_covariance(stamps)):
-            step = relative(poses[row], poses[row + 1])
-            steps[row] = ros_to_gtsam_covariance(self._covariances[int(stamps[row])], step)
-        collected = self._keyframes["noise"][-1] if len(self._keyframes) else np.zeros((6, 6))
-        noise = collected + np.cumsum(propagate(adjoint(self._from_origin(poses[1:])), steps), axis=0)
-        self._keyframes.extend(stamp=stamps, pose=poses[1:], travel=travel, noise=noise)
+            steps[row] = ros_to_gtsam_covariance(self._covariances[int(stamps[row])], moved[row])
+        steps += np.repeat(jumped, 3, axis=1)[:, :, None] * np.eye(6)
+        twists = np.zeros((len(steps), 6, 2))
+        twists[:, 2, 0] = np.linalg.norm(moved[:, :3, 3], axis=1)
+        twists[:, 3:, 1] = (np.swapaxes(moved[:, :3, :3], 1, 2) @ moved[:, :3, 3:])[..., 0]
+        carry = adjoint(self._from_origin(poses[1:]))
+        sums = {"noise": propagate(carry, steps), "drift": carry @ twists}
+        for name, one in sums.items():
+            sums[name] = np.cumsum(one, axis=0) + (self._keyframes[name][-1] if len(self._keyframes) else 0.0)
+        self._keyframes.extend(stamp=stamps, pose=poses[1:], travel=travel, **sums)
 
     def _has_covariance(self, stamps: Stamps) -> NDArray[np.bool_]:
         return np.fromiter((stamp in self._covariances for stamp in stamps.tolist()), bool, len(stamps))

@@ -30,7 +30,7 @@ from umf_ros.pose_graph.consistency import (
     ConsistencyGraph,
     NoiseScale,
     NoiseScaleEstimator,
-    false_alarm_probability,
+    false_alarm_ratio,
     likelihood_ratio,
     squared_mahalanobis,
 )
@@ -48,6 +48,9 @@ _COUNTED, _USUALLY_RIGHT = 5, 0.8
 # wrong closures are seldom single: of those pending at the end of drives in worlds 10200-10473 of
 # `pose_graph.py` (benchmarks) 1 of 67 wrong ones was single and 59 of 213 right ones
 _WRONG_ALONE = 0.1
+# by hand: closures that are up to this many times less likely by the map outweigh those of another place if they are as
+# many; `pose_graph.py --short 20 --seed 10200`: without, four wrong ones of 337 right and as many wrong are accepted
+_RIVAL_RATIO = 10.0
 # nothing contradicts a wrong closure between sessions that are not joined: at the end two places have to agree by 2.5
 # nats at least (*by hand*; `aliased_sessions.py`: without, one group of wrong closures joined 4 of 40 graphs)
 _WRONG_BETWEEN = 10.0
@@ -114,7 +117,8 @@ class OutlierRejection:
         rows = [self._take(placed) for placed in arrived]
         unsolved = bool(self.placed) and self._map is None  # the solver failed when they came
         begun = set(self._sessions.begun) - set(self._sessions.vertices["session"].tolist())
-        if self._rescale() or unsolved or (rows and begun):
+        widened = self._map is not None and self._estimator.widest > self._map.widest
+        if self._rescale() or unsolved or widened or (rows and begun):
             self.solve(rough=True)
             rows = list(range(len(self.placed)))
         self._decide({*rows, *self._near_map})
@@ -238,37 +242,48 @@ class OutlierRejection:
             (self.settings.gate_chi2, self.settings.max_chance) if self.settings.reject_outliers else (np.inf, 1)
         )
         agreed = []
-        for row, distance, misfit_m, joined, ratio, false_alarm in zip(at.tolist(), *self._compare(at), strict=True):
+        for row, distance, misfit_m, joined, ratio, false_alarm, wide in zip(
+            at.tolist(), *self._compare(at), strict=True
+        ):
             state, reason = State.PENDING, ClosureReason.UNSURE
-            if distance > gate:
+            if wide > gate:
                 state, reason = State.REJECTED, ClosureReason.CONTRADICTS
             elif misfit_m > (self.settings.max_correction_m or np.inf):
                 state, reason = State.REJECTED, ClosureReason.TOO_FAR
-            elif false_alarm <= most:
+            elif distance <= gate and false_alarm <= most:
                 agreed.append(row)
             closure, sigmas = self.placed[row].closure, float(np.sqrt(distance))
             self.verdicts[row] = ClosureVerdict(closure, state, reason, sigmas, float(misfit_m))
             self._joined[row], self._ratios[row] = joined, ratio if state is State.PENDING else 1.0
         return agreed
 
-    def _compare(self, rows: NDArray[np.int64]) -> tuple[Array, Array, NDArray[np.bool_], Array, Array]:
+    def _compare(self, rows: NDArray[np.int64]) -> tuple[Array, Array, NDArray[np.bool_], Array, Array, Array]:
         """Compare N closures with the map; a closure between unconnected endpoints agrees with it.
+
+        A closure that contradicts the estimated noise is compared with the widest plausible noise too. The more places
+        agree with the estimated one, the less likely is the other.
 
         Returns:
             (N,) squared Mahalanobis distances, misfits in metres, whether the map joins the endpoints, likelihoods of
-            this distance for a wrong closure over that for a right one, and false-alarm probabilities.
+            this distance for a wrong closure over that for a right one, false-alarm probabilities, and squared
+            Mahalanobis distances by the widest plausible noise.
         """
         assert self._map is not None
         chosen = self.closures[rows]
         bounds, joined = self._map.bounds(chosen["match"], chosen["query"])
-        covariances = bounds[joined] + self.scale.closures**2 * chosen["covariance"][joined]
+        covariances = bounds[:, joined] + self.scale.closures**2 * chosen["covariance"][joined]
         misfits = self._misfits(rows)[joined]
-        (distances, metres), (false_alarms, ratios) = np.zeros((2, len(rows))), np.ones((2, len(rows)))
-        distances[joined] = squared_mahalanobis(logmap(misfits), covariances)
+        (distances, wide, metres), (false_alarms, ratios) = np.zeros((3, len(rows))), np.ones((2, len(rows)))
+        twists = logmap(misfits)
+        distances[joined], wide[joined] = squared_mahalanobis(np.stack([twists] * 2), covariances)
         metres[joined] = np.linalg.norm(misfits[:, :3, 3], axis=1)
-        false_alarms[joined] = false_alarm_probability(covariances, self.settings)
-        ratios[joined] = likelihood_ratio(false_alarms[joined], distances[joined], self.settings)
-        return distances, metres, joined, ratios, false_alarms
+        false_alarms[joined], too_wide = false_alarm_ratio(covariances, self.settings)
+        false_alarms = np.minimum(false_alarms, 1.0)
+        usual = np.minimum(likelihood_ratio(false_alarms[joined], distances[joined], self.settings), 1.0)
+        agreed = {self._consistency.place_of[row] for row in np.flatnonzero(self._of(ClosureReason.AGREES))}
+        unlikely = likelihood_ratio((2 + len(agreed)) * too_wide, wide[joined], self.settings)
+        ratios[joined] = np.where(distances[joined] > self.settings.gate_chi2, unlikely, np.minimum(usual, unlikely))
+        return distances, metres, joined, ratios, false_alarms, wide
 
     def _misfits(self, rows: NDArray[np.int64]) -> Array:
         """Return (N, 4, 4) residual poses: queries of closures by the map, relative to their poses by the closures."""
@@ -283,7 +298,7 @@ class OutlierRejection:
             if members[row] and not any(row in found for found in sets):
                 found, evidence = self._consistency.consistency_set(row, members)
                 # their consistency with the map is further evidence against chance
-                evidence -= float(np.log(max(self._ratios[member] for member in found)))
+                evidence -= float(np.log(min(max(self._ratios[member] for member in found), 1.0)))
                 if evidence >= self.settings.min_support:
                     sets.append(found)
         return sets
@@ -327,10 +342,10 @@ class OutlierRejection:
     def _unopposed(self, at_last: bool = False) -> list[int]:
         """Return pending closures of the best fitting place among those that have waited long enough.
 
-        Neither the map nor another closure contradicts them. One place at a time: the map moved by the first one may
-        contradict the next. The closures of a place are accepted together, by their median odds, so that one of a wrong
-        set is not accepted by chance. The decision at the end does not wait, and counts how many closures were wrong
-        and the evidence of other places.
+        Neither the map nor another closure contradicts them, nor another likely place with as many closures, of joined
+        sessions. One place at a time: the map moved by the first one may contradict the next. The closures of a place
+        are accepted together, by their median odds, so that one of a wrong set is not accepted by chance. The decision
+        at the end does not wait, and counts how many closures were wrong and the evidence of other places.
         """
         waiting = self._of(State.PENDING)
         if not at_last and len(waiting):
@@ -341,13 +356,17 @@ class OutlierRejection:
         places = [[row, *self._consistency.companions(row, companions)] for row in np.flatnonzero(waiting).tolist()]
         self._gate(sorted({member for place in places for member in place}))
         # closures that are likelier wrong than right by the map do not count against others
-        against = self._of(State.ACCEPTED) | (np.array(self._ratios) < 0.5)
+        ratios, pending = np.array(self._ratios), self._of(State.PENDING) & np.array(self._joined, bool)
+        against = self._of(State.ACCEPTED) | (ratios < 0.5)
         best, most_odds = list[int](), _MOST_ODDS_AT_LAST if at_last else _MOST_ODDS
         for place in places:
             odds = self._odds_against(place, at_last)
             usual = [row for row, odd in zip(place, odds, strict=True) if waiting[row] and odd <= most_odds]
             usual = [row for row in usual if not self._consistency.opponents(row, against)]
-            if usual and np.median(odds) <= most_odds:
+            likely = pending & (ratios < _RIVAL_RATIO * np.median(ratios[place]))
+            rivals = {rival for row in usual for rival in self._consistency.opponents(row, likely)}
+            outnumbered = any(len(self._consistency.companions(rival, pending)) + 1 >= len(place) for rival in rivals)
+            if usual and not outnumbered and np.median(odds) <= most_odds:
                 best, most_odds = usual, float(np.median(odds))
         return best
 
@@ -363,7 +382,9 @@ class OutlierRejection:
         odds = odds * np.exp(-self._consistency.consistency_set(place[0], self._of(State.PENDING))[1])
         if not self._joined[place[0]]:
             return odds * max(prior, 1 / _USUALLY_RIGHT - 1) * _WRONG_BETWEEN
-        return odds * prior * (_WRONG_ALONE if len(place) == 1 else 1.0)
+        # of those that contradict the estimated noise most are wrong, and single ones too
+        is_usual = self.verdicts[place[0]].residual ** 2 <= self.settings.gate_chi2
+        return odds * prior * (_WRONG_ALONE if len(place) == 1 and is_usual else 1.0)
 
     def _of(self, decision: State | ClosureReason) -> NDArray[np.bool_]:
         """Return (N,) whether closures have verdicts of a state or a reason."""
@@ -390,7 +411,7 @@ class OutlierRejection:
         self._is_rough = True  # also after an error
         self._sessions.solve(self.accepted, self.scale, rough)
         self._is_rough, self._is_outdated = rough, False
-        self._map = RelativeCovariances(self._sessions)
+        self._map = RelativeCovariances(self._sessions, self._estimator.widest)
         rows = np.flatnonzero(~self._of(State.ACCEPTED) & ~self._revoked)
         self._near_map = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
 

@@ -15,7 +15,16 @@ from umf_ros.core.geometry import Array, adjoint, invert, propagate
 from umf_ros.core.trajectory import EDGE
 from umf_ros.pose_graph.closures import Closures
 from umf_ros.pose_graph.consistency import NoiseScale
-from umf_ros.pose_graph.odometry import POINT, CorrectedPath, OdometryChain, PathPoints, Rows, Stamps, noise_between
+from umf_ros.pose_graph.odometry import (
+    POINT,
+    CorrectedPath,
+    OdometryChain,
+    PathPoints,
+    Rows,
+    Stamps,
+    drift_between,
+    noise_between,
+)
 from umf_ros.pose_graph.solver import Graph, GraphSolver
 
 # longest path between two solved poses, m. measured on a kilometre whose heading is off by 140 deg: between closures
@@ -233,14 +242,19 @@ class RelativeCovariances:
 
     The covariance of a relative pose is at most that along any single path through odometry and
     accepted closures; the best such path is found by Dijkstra. Being an upper bound it never rejects a
-    right closure too early, and it needs no marginals of the whole system.
+    right closure too early, and it needs no marginals of the whole system. There are two bounds: by the estimated
+    noise, and by the widest plausible one, a `widest` factor of the stated odometry noise and constant errors.
+
+    Attributes:
+        widest: the largest plausible factor of the stated standard deviations of the odometry.
     """
 
-    def __init__(self, sessions: Sessions) -> None:
+    def __init__(self, sessions: Sessions, widest: float) -> None:
         assert sessions.solution is not None
+        self.widest = widest
         self._sessions, self._vertices, self._poses = sessions, sessions.vertices, sessions.solution.poses
-        self._variance_scale = sessions.scale.odometry**2
-        edges, size = sessions.solution.edges, len(self._poses)
+        self._variance_scales = np.square([sessions.scale.odometry, max(widest, sessions.scale.odometry)])
+        keys, edges, size = sessions.solution.keys, sessions.solution.edges, len(self._poses)
         low, high = np.sort([edges["first"], edges["second"]], axis=0)
         lengths = _length(edges["covariance"])
         # only the shortest of parallel edges: a sparse matrix would add them up
@@ -250,17 +264,20 @@ class RelativeCovariances:
         self._paths = csr_matrix((lengths[rows], (low[rows], high[rows])), shape=(size, size))
         # at the first vertex, so that covariances along a path add up
         carry = adjoint(invert(self._poses[:1]) @ self._poses[edges["second"][rows]])
-        self._noise = propagate(carry, edges["covariance"][rows])
+        noise, odometry = np.stack([edges["covariance"]] * 2), np.flatnonzero([isinstance(k, tuple) for k in keys])
+        walked = self._walk(*(self._vertices[edges[end][odometry]] for end in ("first", "second")))
+        noise[:, odometry] = propagate(adjoint(invert(self._vertices["pose"][edges["second"][odometry]])), walked)
+        self._noise = propagate(carry, noise[:, rows])
 
     def bounds(self, match: PathPoints, query: PathPoints) -> tuple[Array, NDArray[np.bool_]]:
-        """Return (N, 6, 6) bounds of `match_T_query`, GTSAM order, tangent space of the query, and (N,) whether known.
+        """Return (2, N, 6, 6) bounds of `match_T_query`, GTSAM order, tangent space of the query, and (N,) if known.
 
         Where no path joins the points, bounds are infinite on the diagonal.
         """
         poses = self._sessions.at(query)
-        covariances = self._variance_scale * propagate(adjoint(invert(query["pose"])), noise_between(match, query))
-        covariances[match["session"] != query["session"]] = np.diag(np.full(6, np.inf))
-        lengths = _length(covariances)
+        covariances = propagate(adjoint(invert(query["pose"])), self._walk(match, query))
+        covariances[:, match["session"] != query["session"]] = np.diag(np.full(6, np.inf))
+        lengths = _length(covariances[0])
         order = np.argsort(lengths, kind="stable")
         for first in range(0, len(order), _AT_ONCE):
             rows = order[first : first + _AT_ONCE]
@@ -275,33 +292,38 @@ class RelativeCovariances:
         for point in (match, query):
             beside = self._nearest(point)
             turn = adjoint(invert(poses) @ self._sessions.at(point) @ invert(point["pose"]))
-            noise = propagate(turn, noise_between(point, self._vertices[beside]))
-            ends.append((beside, self._variance_scale * noise))
+            ends.append((beside, propagate(turn, self._walk(point, self._vertices[beside]))))
         # paths are symmetric: trees grow from the side with fewer roots
         (starts, leave), (stops, enter) = sorted(ends, key=lambda one: len(np.unique(one[0])))
         sources, of_source = np.unique(starts, return_inverse=True)
         found, before = dijkstra(
             self._paths, directed=False, indices=sources, return_predecessors=True, limit=lengths[rows].max()
         )
-        totals = _length(leave) + found[of_source, stops] + _length(enter)
+        totals = _length(leave[0]) + found[of_source, stops] + _length(enter[0])
         shorter = np.flatnonzero(totals < lengths[rows])
         along = propagate(
             adjoint(invert(poses[shorter]) @ self._poses[:1]), self._along(before[of_source[shorter]], stops[shorter])
         )
-        covariances[rows[shorter]] = leave[shorter] + enter[shorter] + along
+        covariances[:, rows[shorter]] = leave[:, shorter] + enter[:, shorter] + along
         lengths[rows[shorter]] = totals[shorter]
 
     def _along(self, before: NDArray[np.int32], here: Rows) -> Array:
-        """Return (M, 6, 6) noise along paths, from the (M, V) predecessors of vertices and the (M,) last vertices."""
-        sums, running = np.zeros((len(here), 6, 6)), np.arange(len(here))
+        """Return (2, M, 6, 6) noise along paths, from (M, V) predecessors of vertices and the (M,) last vertices."""
+        sums, running = np.zeros((2, len(here), 6, 6)), np.arange(len(here))
         while len(running):  # one step of every path that is not yet at its source
             there = before[running, here].astype(np.int64)
             goes_on = there >= 0
             running, here, there = running[goes_on], here[goes_on], there[goes_on]
             keys = np.minimum(here, there) * len(self._poses) + np.maximum(here, there)
-            sums[running] += self._noise[np.searchsorted(self._keys, keys)]
+            sums[:, running] += self._noise[:, np.searchsorted(self._keys, keys)]
             here = there
         return sums
+
+    def _walk(self, a: PathPoints, b: PathPoints) -> Array:
+        """Return (2, N, 6, 6) noise of the odometry between points, estimated and widest, at the origin of both."""
+        walked = self._variance_scales[:, None, None, None] * noise_between(a, b)
+        walked[1] += drift_between(a, b)
+        return np.asarray(walked)
 
     def _nearest(self, points: PathPoints) -> Rows:
         """Return the solved vertices (N,) of the points' sessions that are nearest to them by odometry."""

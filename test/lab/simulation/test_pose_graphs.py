@@ -11,6 +11,7 @@ from umf_ros.lab.simulation.pose_graphs import (
     GraphWorld,
     Kind,
     rover_loops,
+    short_revisit,
     with_bias,
     with_lone_end,
     with_wrong_closures,
@@ -91,3 +92,15 @@ def test_a_lone_end_leaves_one_closure_in_the_second_half() -> None:
     lone = with_lone_end(world)
     assert [closure.second for closure in lone.closures if closure.second >= 200] == [world.closures[-1].second]
     assert len(lone.closures) == 1 + sum(closure.second < 200 for closure in world.closures) > 1
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_short_revisit_closes_one_place_after_a_loop(seed: int) -> None:
+    world = short_revisit(seed)
+    lengths = np.linalg.norm(np.diff(world.truth[:, :3, 3], axis=0), axis=1)
+    assert 30 < lengths.sum() < 80 and 5 < len(world.closures) < 30
+    assert all(closure.right for closure in world.closures) and off_by(world, True).max() < 0.5
+    first, second = (np.array([getattr(one, end) for one in world.closures]) for end in ("first", "second"))
+    assert np.linalg.norm(world.truth[first, :3, 3] - world.truth[second, :3, 3], axis=1).max() < 2
+    drift = np.linalg.norm(world.odometry[-1][:3, 3] - world.truth[-1][:3, 3])
+    assert 0.1 < drift < 10

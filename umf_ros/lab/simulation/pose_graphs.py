@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, expmap, from_enu, gtsam_to_ros_covariance, invert, orthonormal, relative
+from umf_ros.lab.simulation.motion_sensors import Drift, drifted
 
 Kind = Literal["random", "groups", "near"]
 PERIOD_NS = 1_000_000_000
@@ -95,6 +96,35 @@ def garage(size: int, seed: int) -> GraphWorld:
     level = 3.0 * (np.floor(floors) + np.clip((floors % 1 - 0.75) * 4, 0, 1))
     plan = np.tile(lap, (laps, 1)) + np.repeat(rng.normal(0, 0.4, (laps, 2)), len(lap), axis=0)
     return _drive(np.column_stack([plan, level])[:size], rng, spacing=6)
+
+
+def short_revisit(seed: int, step_m: float = 0.5) -> GraphWorld:
+    """One loop of 30 to 60 m and 5 to 14 m of it again, with the demo's kind of drift and stated noise of 5 cm, .5 deg.
+
+    The errors of scale (.5 to 4 %) and of heading (.05 to .35 deg/m) are constant; neither is stated.
+    """
+    rng = np.random.default_rng([seed, 3])
+    length, again = rng.uniform(30, 60), rng.uniform(5, 14)
+    angles = np.linspace(0, 2 * np.pi, 400)
+    radius = 1 + sum(rng.uniform(-0.2, 0.2) * np.cos(k * angles + rng.uniform(0, 6.3)) for k in (2, 3))
+    loop = np.stack([radius * np.cos(angles), radius * np.sin(angles)], axis=1)
+    loop *= length / np.linalg.norm(np.diff(loop, axis=0), axis=1).sum()
+    lap = _resample(loop, step_m)
+    beside = lap[: int(again / step_m)] * (1 + rng.uniform(-0.7, 0.7) / np.linalg.norm(lap, axis=1).mean())
+    points = np.column_stack([np.concatenate([lap, beside]), np.zeros(len(lap) + len(beside))])
+    truth = _upright(points)
+    drift = Drift(rng.uniform(0.005, 0.04), rng.uniform(0.05, 0.35), rng.uniform(0.2, 0.6), 0.01)
+    odometry = drifted(truth, drift, rng)[0]
+    covariances = np.zeros((len(truth), 6, 6))
+    covariances[1:] = step_m * np.diag(np.array([*np.deg2rad([0.5] * 3), 0.05, 0.05, 0.05]) ** 2)
+    world = GraphWorld(truth, truth[0] @ invert(odometry[0]) @ odometry, covariances, [])
+    closures = []
+    for j in range(len(lap) + 2, len(truth)):
+        i = int(np.argmin(np.linalg.norm(points[: len(lap) // 3] - points[j], axis=1)))
+        noise = expmap((rng.normal(size=6) * _CLOSURE_SIGMAS)[None])[0]
+        pose = relative(truth[i], truth[j]) @ noise
+        closures.append(WorldClosure(i, j, pose, np.diag(_CLOSURE_SIGMAS**2), True))
+    return replace(world, closures=closures)
 
 
 WORLDS: dict[str, Callable[[int, int], GraphWorld]] = {"rover": rover_loops, "sphere": sphere, "garage": garage}
@@ -201,15 +231,21 @@ def _resample(corners: Array, step: float) -> Array:
 
 def _drive(points: Array, rng: np.random.Generator, spacing: int, reach_m: float = 2.5) -> GraphWorld:
     """Look along the way, drift, and close a loop about every `spacing` poses where a place is passed again."""
-    forward = np.gradient(points, axis=0)
-    yaw = np.arctan2(forward[:, 1], forward[:, 0])
-    pitch = -np.arctan2(forward[:, 2], np.linalg.norm(forward[:, :2], axis=1))
-    truth = np.tile(np.eye(4), (len(points), 1, 1))
-    truth[:, :3, :3] = Rotation.from_euler("ZY", np.stack([yaw, pitch], axis=1)).as_matrix()
-    truth[:, :3, 3] = points
+    truth = _upright(points)
     odometry, covariances = _drift(truth, rng)
     world = GraphWorld(truth, odometry, covariances, [])
     return replace(world, closures=_true_closures(world, rng, spacing, reach_m))
+
+
+def _upright(points: Array) -> Array:
+    """(N, 4, 4) poses at points (N, 3) that look along the way."""
+    forward = np.gradient(points, axis=0)
+    yaw = np.arctan2(forward[:, 1], forward[:, 0])
+    pitch = -np.arctan2(forward[:, 2], np.linalg.norm(forward[:, :2], axis=1))
+    poses = np.tile(np.eye(4), (len(points), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("ZY", np.stack([yaw, pitch], axis=1)).as_matrix()
+    poses[:, :3, 3] = points
+    return poses
 
 
 def _drift(truth: Array, rng: np.random.Generator) -> tuple[Array, Array]:
