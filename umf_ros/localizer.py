@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import PoseGraphSettings, Settings
-from umf_ros.core.errors import GraphError, UmfError, writing
+from umf_ros.core.errors import GraphError, UmfError, one_line, writing
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import (
     Array,
@@ -28,6 +28,7 @@ from umf_ros.core.geometry import (
     relative,
     ros_to_gtsam_covariance,
 )
+from umf_ros.core.limits import open_archive
 from umf_ros.core.odometry_noise import OdometryNoise
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.pose_graph.backend import MAX_WAITING, Key, PoseGraph
@@ -321,10 +322,11 @@ def _logit(probability: float) -> float:
 def read_poses(path: Path) -> Trajectory:
     """Read the poses of a map's places, on the map's clock; raise an `UmfError` if the map has not been solved."""
     try:
-        with np.load(path / POSES) as stored:
+        with open_archive(path / POSES), np.load(path / POSES) as stored:
             return Trajectory(stored["stamps"], stored["poses"])
-    except (OSError, ValueError, KeyError):
-        raise UmfError(f"{path / POSES} cannot be read: run umf map to solve the map") from None
+    except Exception as error:  # damaged bytes raise any exception
+        cause = one_line(error)
+        raise UmfError(f"{path / POSES} cannot be read ({cause}): run umf map to solve the map") from None
 
 
 def open_localizer(settings: Settings) -> Localizer:

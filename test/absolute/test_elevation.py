@@ -72,6 +72,26 @@ def test_a_file_that_is_no_model_is_one_line(tmp_path: Path, name: str) -> None:
     assert "\n" not in str(error.value)
 
 
+def test_a_small_file_of_many_heights_is_refused(tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    layout = {"driver": "GTiff", "dtype": "float32", "sparse_ok": True, "tiled": True}
+    layout["transform"] = rasterio.transform.from_origin(0, 0, 1, 1)
+    layouts = {
+        "side.tif": {"width": 10_000, "height": 10_000, "count": 1},
+        "block.tif": {"width": 4096, "height": 4096, "count": 20, "blockxsize": 4096, "blockysize": 4096},
+    }
+    for name, more in layouts.items():
+        with rasterio.open(tmp_path / name, "w", **layout, **more):
+            pass
+    (tmp_path / "side.asc").write_text(
+        "ncols 99999\nnrows 99999\nxllcorner 0\nyllcorner 0\ncellsize 1\nnodata_value 0\n1"
+    )
+    for name in (*layouts, "side.asc"):
+        with pytest.raises(ConfigError, match="too large to be read") as caught:
+            load_elevation(tmp_path / name, 0.3, None)
+        assert "\n" not in str(caught.value)
+
+
 def test_heights_of_another_datum_count_by_their_differences() -> None:
     model = ElevationModel(grid(4.0), np.array([[0.25, 0, 0], [0, 0.25, 0]]), 4.0, 0.3)
     poses = np.tile(np.eye(4), (20, 1, 1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import gc
 import os
 import resource
 import shutil
@@ -11,13 +12,14 @@ import struct
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import lz4.frame
 import numpy as np
 import pytest
 import zstandard
 from mcap.reader import make_reader
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from recordings import small_settings, traverse, write_db3, write_mcap, write_ros1
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -25,8 +27,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from umf_ros.bags import reader
 from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.reader import open_bag, unpack
-from umf_ros.core.errors import BagError
+from umf_ros.bags.reader import RawMessage, decode, open_bag, unpack
+from umf_ros.core.errors import BagError, MessageError
+from umf_ros.sensors.decode import CLOUD, LIVOX
 
 ENTRIES = traverse(0.4)
 NOETIC = traverse(0.4, get_typestore(Stores.ROS1_NOETIC))
@@ -93,8 +96,8 @@ def test_a_chunk_that_claims_gigabytes_is_not_unpacked(tmp_path: Path) -> None:
 
 def test_a_bzip2_chunk_is_unpacked_to_a_limit_only(monkeypatch: pytest.MonkeyPatch) -> None:
     assert unpack("bz2", bz2.compress(b"abc" * 1000)) == b"abc" * 1000
-    monkeypatch.setattr("umf_ros.bags.reader.LARGEST_CHUNK", 2**16)
-    with pytest.raises(ValueError, match="more than"):
+    monkeypatch.setattr("umf_ros.core.limits.LARGEST_UNPACKED", 2**16)
+    with pytest.raises(ValueError, match="too large"):
         unpack("bz2", bz2.compress(bytes(2**20)))
 
 
@@ -106,8 +109,8 @@ def zeros_in_lz4(count: int) -> bytes:
 
 def test_an_lz4_chunk_is_unpacked_to_a_limit_only(monkeypatch: pytest.MonkeyPatch) -> None:
     assert unpack("lz4", lz4.frame.compress(b"abc" * 1000)) == b"abc" * 1000
-    monkeypatch.setattr("umf_ros.bags.reader.LARGEST_CHUNK", 2**16)
-    with pytest.raises(ValueError, match="more than"):
+    monkeypatch.setattr("umf_ros.core.limits.LARGEST_UNPACKED", 2**16)
+    with pytest.raises(ValueError, match="too large"):
         unpack("lz4", zeros_in_lz4(2**25))
 
 
@@ -146,20 +149,20 @@ def test_no_packing_hides_how_large_a_chunk_is(broken: bool, tmp_path: Path, mon
             path.write_bytes(path.read_bytes()[:-100])
         assert len(list(open_bag(path).raw_messages())) == 200
     with monkeypatch.context() as limited:
-        limited.setattr("umf_ros.bags.reader.LARGEST_CHUNK", 2500)
+        limited.setattr("umf_ros.core.limits.LARGEST_UNPACKED", 2500)
         for packing in CompressionType:  # what they claim is looked at before
-            with pytest.raises(BagError, match="holds no message"):
+            with pytest.raises(BagError, match=r"holds no message \((a chunk is too large|CHUNK record has length)"):
                 open_bag(tmp_path / f"{packing}.mcap")
     really = reader.unpack
 
     def fooled(compression: str, data: bytes) -> bytes:  # as if the file had claimed less than it holds
         with monkeypatch.context() as limited:
-            limited.setattr(reader, "LARGEST_CHUNK", 2500)
+            limited.setattr("umf_ros.core.limits.LARGEST_UNPACKED", 2500)
             return really(compression, data)
 
     monkeypatch.setattr(reader, "unpack", fooled)
     path = tmp_path / f"{CompressionType.LZ4}.mcap"
-    with pytest.raises(BagError, match="holds no message" if broken else "holds more than"):
+    with pytest.raises(BagError, match="holds no message" if broken else "too large"):
         list(open_bag(path).raw_messages())
 
 
@@ -174,8 +177,8 @@ def test_a_chunk_of_ros_1_in_lz4_is_unpacked_to_a_limit_only(tmp_path: Path, mon
         for log_ns in range(1, 50):
             writer.write(connection, log_ns, store.serialize_ros1(message, message.__msgtype__))
     assert len(list(open_bag(path).raw_messages())) == 49
-    monkeypatch.setattr("umf_ros.bags.reader.LARGEST_CHUNK", 2**12)
-    with pytest.raises(BagError, match="holds more than"):
+    monkeypatch.setattr("umf_ros.core.limits.LARGEST_UNPACKED", 2**12)
+    with pytest.raises(BagError, match="too large"):
         list(open_bag(path).raw_messages())
 
 
@@ -215,3 +218,83 @@ def test_metadata_of_another_kind_is_not_needed_and_alone_one_line(tmp_path: Pat
             read(alone, tmp_path)
         assert "\n" not in str(caught.value)
         shutil.rmtree(copy)
+
+
+def test_values_of_a_db3_file_are_limited_packed_or_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = KINDS["db3"](tmp_path)
+    packed = zstandard.ZstdCompressor().compress(bytes(2**24))
+    monkeypatch.setattr("umf_ros.core.limits.LARGEST_UNPACKED", 2**23)
+    for name, value, text in (
+        ("a.db3", f"x'{packed.hex()}'", "too large"),
+        ("b.db3", f"zeroblob({2**24})", "a message has more than 8.389 MB"),
+    ):
+        shutil.copy(path, tmp_path / name)
+        with closing(sqlite3.connect(tmp_path / name)) as connection, connection:
+            connection.execute(f"UPDATE messages SET data = {value} WHERE id = 1")
+        with pytest.raises(BagError, match=text) as caught:
+            list(open_bag(tmp_path / name).raw_messages())
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_a_file_packed_as_a_whole_is_read(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a.{kind}.zstd"
+    path.write_bytes(zstandard.ZstdCompressor().compress(KINDS[kind](tmp_path).read_bytes()))
+    assert len(list(open_bag(path).raw_messages())) == len(ENTRIES)
+
+
+def test_a_file_packed_as_a_whole_is_refused_before_it_fills_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.db3.zstd"
+    path.write_bytes(zstandard.ZstdCompressor().compress(KINDS["db3"](tmp_path).read_bytes() + bytes(2**27)))
+    monkeypatch.setattr("umf_ros.core.limits.LARGEST_UNPACKED", 2**20)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    sizes = []
+
+    def watched(stream: Any, file: Any) -> None:
+        try:
+            shutil.copyfileobj(stream, file)
+        finally:
+            sizes.append(file.tell())
+
+    monkeypatch.setattr(reader, "copyfileobj", watched)
+    with pytest.raises(BagError, match="too large") as caught:
+        open_bag(path)
+    assert "\n" not in str(caught.value)
+    assert sizes[0] < 2**24
+    del caught
+    gc.collect()
+    assert not list(tmp_path.glob("umf_ros_*"))
+
+
+def test_a_chunk_of_endless_messages_is_read_to_a_number_only(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    for is_indexed in (True, False):
+        with path.open("wb") as file:
+            writer = McapWriter(file, chunk_size=2**30, compression=CompressionType.ZSTD, index_types=IndexType.CHUNK)
+            writer.start("ros2")
+            schema = writer.register_schema("std_msgs/msg/Empty", "ros2msg", b"")
+            channel = writer.register_channel("/empty", "cdr", schema)
+            for _ in range(40_000):
+                writer.add_message(channel, 5, b"", 5)
+            writer.finish()
+        if is_indexed:
+            with pytest.raises(BagError, match="are no recording"):
+                list(open_bag(path).raw_messages())
+        else:
+            path.write_bytes(path.read_bytes()[:-100])
+            assert "are no recording" in open_bag(path).warning
+            assert len(list(open_bag(path).raw_messages())) < 10_000
+
+
+def test_a_message_of_millions_of_items_is_not_decoded() -> None:
+    head = b"\x00\x01\x00\x00" + struct.pack("<iII", 1, 0, 4) + b"abc\0"
+    field = struct.pack("<I", 2) + b"x\0\0\0" + struct.pack("<IB3xI", 0, 7, 1)
+    cloud = head + struct.pack("<III", 1, 1, 600_000) + field * 600_000
+    livox = head + struct.pack("<QIBBBBI", 0, 500_000, 0, 0, 0, 0, 500_000) + bytes(20 * 500_000)
+    for kind, data in ((CLOUD, cloud), (LIVOX, livox)):
+        with pytest.raises(MessageError, match="too large"):
+            decode(RawMessage("/points", 1, kind, data))
+    with pytest.raises(MessageError, match="does not match"):  # cut before its fields
+        decode(RawMessage("/points", 1, CLOUD, cloud[:16]))

@@ -270,10 +270,8 @@ def test_what_is_no_recording_is_one_clear_line(name: str, content: bytes, text:
 def test_missing_file_and_foreign_folder(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="there is no recording"):
         open_bag(tmp_path / "nothing.mcap")
-    with pytest.raises(BagError, match=r"holds neither metadata\.yaml nor"):
-        open_bag(tmp_path)
     (tmp_path / "metadata.yaml").write_text("nonsense: true")
-    with pytest.raises(BagError, match="cannot be read"):
+    with pytest.raises(BagError, match="holds neither mcap nor db3 files"):
         open_bag(tmp_path)
 
 

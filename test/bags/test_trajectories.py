@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 import pytest
@@ -161,6 +162,19 @@ def test_tum_files_that_cannot_be_read_or_written(tmp_path: Path) -> None:
         read_tum(tmp_path / "binary.tum")
     with pytest.raises(OutputError, match="cannot write"):
         write_tum(tmp_path / "no folder" / "a.tum", trajectory())
+
+
+@pytest.mark.parametrize(
+    "line", ["1" + " " * 10**6 + "2", "q" + "," * 900_000 + "2", "# q" + "[" * 10**6, "1 " * 10**7], ids=len
+)
+def test_long_lines_take_no_time(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text(line + "\n")
+    start = process_time()
+    with pytest.raises(BagError, match=r"expected|no pose|a line has more than") as caught:
+        read_tum(path)
+    assert process_time() - start < 3
+    assert "\n" not in str(caught.value)
 
 
 def test_poses_between_the_samples_are_those_of_the_drive() -> None:

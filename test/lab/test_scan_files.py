@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 import open3d as o3d
@@ -142,6 +144,10 @@ def test_a_text_whose_other_fields_hold_raw_bytes_is_read_as_far_as_the_points_g
     np.testing.assert_allclose(found[:10], np.round(POINTS[:10], 2), atol=1e-6)
 
 
+LONG_LZF = struct.pack("<II", 2 + 3 * 10**6, 1000) + b"\x00\x00" + b"\xe0\xff\x00" * 10**6
+LONG_NPY = (
+    b"\x93NUMPY\x01\0v\0" + b"{'descr': '<f4', 'fortran_order': False, 'shape': (10000000000, 3), }".ljust(117) + b"\n"
+)
 PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
 
 
@@ -160,6 +166,21 @@ PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float
         ("a.pcd", b"FIELDS x y z\nDATA zipped\n", "'zipped'"),
         ("a.pcd", b"FIELDS x y z\nDATA binary_compressed\n\x05\0\0\0\x0c\0\0\0\xe0", "break off"),
         ("a.pcd", b"FIELDS x y z\nDATA binary_compressed\n\x02\0\0\0\x0c\0\0\0\x40\x10", "damaged"),
+        ("a.pcd", b"\n" * 10**6, "without a DATA line in its first 64 kB"),
+        ("a.pcd", b"FIELDS" + b" x" * 10**6 + b"\nDATA ascii\n", "without a DATA line in its first 64 kB"),
+        ("a.pcd", b"FIELDS" + b" x" * 30_000 + b"\nDATA ascii\n", "no field x, y, z"),
+        ("a.pcd", b"FIELDS x y z\nDATA ascii\n" + b"1 1 1\n" * 1_200_000, "numbers or more: split it"),
+        ("a.pcd", b"FIELDS x y z\nDATA ascii\n" + b"1 1 1 " * 1_200_000, "numbers or more: split it"),
+        ("a.pcd", b"FIELDS x y z a\nDATA ascii\n" + b"1 1 1 \xff\n" * 500_000, "numbers or more: split it"),
+        (
+            "a.pcd",
+            b"FIELDS x y z\nDATA binary_compressed\n" + struct.pack("<II", 9, 10**8) + bytes(9),
+            "more than 9 MB",
+        ),
+        ("a.pcd", b"FIELDS x y z\nDATA binary_compressed\n" + LONG_LZF, "or more, 1000 expected"),
+        ("a.ply", b"ply\n" + b"\n" * 10**7, "more than 64 kB"),
+        ("a.ply", PLY.replace("vertex 2", "vertex 4000000000").encode() + b"1 2 3\n", "break off before 4000000000"),
+        ("a.npy", LONG_NPY, "no array of numbers"),
         ("a.ply", b"plywood", "breaks off"),
         ("a.ply", PLY.replace("ascii", "oral").encode(), "'oral'"),
         ("a.ply", (PLY + "1 2 3\n").encode(), "break off before 2"),
@@ -174,11 +195,16 @@ PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float
         ("a.las", b"LASF", "expected .pcd, .ply, .npy or .bin"),
     ],
 )
-def test_what_is_no_scan_is_named_on_one_line(tmp_path: Path, name: str, content: bytes, text: str) -> None:
+def test_what_is_no_scan_is_named_on_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, text: str
+) -> None:
     path = tmp_path / name
     path.write_bytes(content)
+    monkeypatch.setattr("umf_ros.core.limits.LARGEST_UNPACKED", 9 * 10**6)
+    start = process_time()
     with pytest.raises(SensorFileError) as caught:
         read_scan(path)
+    assert process_time() - start < 3
     assert text in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 

@@ -57,6 +57,13 @@ def test_eight_bits_take_half_the_space_and_say_nearly_the_same(tmp_path):
     assert (network(batch).descriptor * restored(batch).descriptor).sum(-1).min() > 0.999
 
 
+def test_weights_with_an_endless_header_are_refused(tmp_path):
+    path = tmp_path / "a.safetensors"
+    path.write_bytes((9 * 10**6).to_bytes(8, "little") + b'{"a":[' + b"{}," * 3 * 10**6)
+    with pytest.raises(WeightsError, match="header is too large"):
+        load_weights(path)
+
+
 def test_shipped_weights_are_known_by_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert locate_weights(None) == locate_weights(Path("umf_scene"))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import islice
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.errors import ConfigError, reading
 from umf_ros.core.geometry import Array, from_enu
+from umf_ros.core.limits import LARGEST_UNPACKED, check_size, lines_of
 
 _HUBER = 1.345
 # by hand: sigma along the ground, which a height does not measure; sigma of the position on a slope, in cells
@@ -113,9 +116,10 @@ def load_elevation(path: Path, sigma_m: float, origin: Array | None) -> Elevatio
 
 def _read_ascii(path: Path) -> tuple[Array, Array]:
     """Return heights and `pixel_T_world`, as for a GeoTIFF."""
-    lines = path.read_text(encoding="ascii").splitlines()
-    head = {name.lower(): float(value) for name, value in (line.split() for line in lines[:6])}
-    heights = np.loadtxt(lines[6:])
+    lines = lines_of(path)
+    head = {name.lower(): float(value) for name, value in (line.split() for line in islice(lines, 6))}
+    check_size(4 * head["ncols"] * head["nrows"], path.name, LARGEST_UNPACKED + path.stat().st_size)
+    heights = np.loadtxt(lines, np.float32, max_rows=int(head["nrows"]), ndmin=2)
     heights[heights == head.get("nodata_value", np.nan)] = np.nan
     cell, rows = head["cellsize"], len(heights)
     half = 0.5 if "xllcorner" in head else 0.0
@@ -133,8 +137,12 @@ def _read_geotiff(path: Path, origin: Array | None) -> tuple[Array, Array]:
         raise ConfigError(
             f"elevation model {path}: rasterio is not installed (pip install umf_ros[elevation]); .asc needs none"
         ) from None
-    with rasterio.open(path) as file:
-        heights = file.read(1, masked=True).astype(float).filled(np.nan)
+    with rasterio.Env(GDAL_CACHEMAX=16), rasterio.open(path) as file:
+        block = prod(file.block_shapes[0]) * np.dtype(file.dtypes[0]).itemsize * file.count
+        check_size(4 * file.width * file.height, path.name, LARGEST_UNPACKED + 4 * path.stat().st_size)
+        check_size(block, f"a block of {path.name}")
+        found = file.read(1, masked=True, out_dtype=np.float32)
+        heights = np.where(np.ma.getmaskarray(found), np.float32(np.nan), found.data)
         to_pixel: Any = ~file.transform
         if file.crs is None:
             corners = world = np.array([[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]])

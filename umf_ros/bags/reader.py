@@ -9,31 +9,34 @@ import struct
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
+from io import BytesIO
 from itertools import chain, islice
 from pathlib import Path
-from typing import IO, Any
+from shutil import copyfileobj
+from tempfile import TemporaryDirectory
+from typing import Any
 
+import apsw
 import lz4.frame
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
-from zstandard import ZstdDecompressor, ZstdError, frame_content_size
+from zstandard import ZstdError
 
+from umf_ros.core import limits
 from umf_ros.core.errors import BagError, MessageError, check_utf8, one_line, printable, reading
-from umf_ros.sensors.decode import LIVOX, stamp_ns
-
-LARGEST_CHUNK = 2**28
-"""Most bytes of an unpacked chunk, and of any record; recorders write some megabytes."""
-
+from umf_ros.core.limits import PackedFile, check_count, check_size, unpack
+from umf_ros.sensors.decode import CLOUD, COMPRESSED, IMAGE, LIVOX, stamp_ns
 
 LIVOX_DEFINITION = """
 std_msgs/Header header
@@ -83,36 +86,17 @@ def message_types() -> Typestore:
     return store
 
 
-_DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}
-_ZSTD = b"\x28\xb5\x2f\xfd"
-
-
-def unpack(compression: str, data: bytes) -> bytes:
-    """Return the contents of a chunk or a message compressed as "bz2", "lz4" or "zstd".
-
-    Raises:
-        ValueError: they are larger than `LARGEST_CHUNK`.
-    """
-    if compression == "zstd":
-        with ZstdDecompressor().stream_reader(data) as stream:
-            unpacked = stream.read(LARGEST_CHUNK + 1)
-    else:
-        unpacked = _DECOMPRESSORS[compression]().decompress(data, LARGEST_CHUNK + 1)
-    if len(unpacked) > LARGEST_CHUNK:
-        raise ValueError(f"a chunk holds more than {LARGEST_CHUNK} bytes")
-    return unpacked
+_ZSTD, PACKED = b"\x28\xb5\x2f\xfd", (".zst", ".zstd")
 
 
 # exceptions of the mcap library and the decompressors on damaged data
 _DAMAGE = (McapError, struct.error, ZstdError, ValueError, RuntimeError, EOFError, LookupError, TypeError, MemoryError)
 
-_CHUNK_HEAD = 64
-"""Bytes at the start of a chunk's record that hold its stated size, compression included."""
-
 SORTING_WINDOW_NS = 1_000_000_000
 """Without an index, messages are sorted within this window of time."""
-MOST_WAITING = 2**28
-"""Most bytes of messages in the reorder buffer; a second of a recording has some dozens of megabytes."""
+MOST_WAITING, EACH = 2**27, 500
+"""Most bytes of messages in the reorder buffer, and those of a message besides its data; a second has some dozens of
+megabytes."""
 PlacedMessage = tuple[int, tuple[int, int], RawMessage]
 """Lower bound of the times of later messages, position in the file to order equal times, message."""
 
@@ -126,7 +110,7 @@ class McapFile:
 
     def __init__(self, path: Path) -> None:
         self.path, self._fault, self.warning = path, "", ""
-        self._is_packed, self._is_sorted = path.suffix in (".zstd", ".zst"), True
+        self._is_packed, self._is_sorted = path.suffix in PACKED, True
         self._chunks: list[ChunkIndex] = []
         self.types: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
@@ -143,9 +127,9 @@ class McapFile:
         return heapq.merge(*(_in_order(self._read_sequentially(one)) for one in passes), key=lambda one: one.log_ns)
 
     @contextmanager
-    def _open(self) -> Iterator[IO[bytes]]:
-        with self.path.open("rb") as stream:
-            yield ZstdDecompressor().stream_reader(stream) if self._is_packed else stream
+    def _open(self) -> Iterator[Any]:
+        with self.path.open("rb") if not self._is_packed else PackedFile(self.path) as stream:
+            yield stream
 
     def _read_index(self) -> None:
         with self.path.open("rb") as stream:
@@ -158,7 +142,11 @@ class McapFile:
         if summary.channels and not channels:
             encodings = ", ".join(sorted({channel.message_encoding for channel in summary.channels.values()}))
             raise BagError(f"{self.path} holds messages encoded as {encodings}; only those of ROS 2 (cdr) can be read")
-        _check_chunks(self.path, summary.chunk_indexes)
+        size = self.path.stat().st_size
+        for index in summary.chunk_indexes:
+            check_size(max(index.chunk_length, index.uncompressed_size), "a chunk")
+            if index.chunk_start_offset + index.chunk_length > size:
+                raise ValueError("a chunk lies beyond the end")
         self._channels = {
             key: (printable(channel.topic), summary.schemas[channel.schema_id].name)
             for key, channel in channels.items()
@@ -180,16 +168,21 @@ class McapFile:
             self.end_ns = max(self.end_ns, message.log_ns)
         if self._fault:
             seconds, count = max(0, self.end_ns - self.start_ns) * 1e-9, self.counts.total()
-            self.warning = f"{self.path} is truncated; its first {seconds:.1f} s ({count} messages) are readable"
+            readable = f"{self.path} is truncated; its first {seconds:.1f} s ({count} messages) are readable"
+            self.warning = f"{readable} ({self._fault})" if count else self._fault
 
     def _by_index(self, topics: Collection[str]) -> Iterator[PlacedMessage]:
         wanted = {key: channel for key, channel in self._channels.items() if channel[0] in topics}
+        number, size = 0, self.path.stat().st_size
         with self.path.open("rb") as stream:
             for index in self._chunks:
                 if index.message_index_offsets and not wanted.keys() & index.message_index_offsets.keys():
                     continue
-                stream.seek(index.chunk_start_offset + 9)
-                for number, record in enumerate(_unpacked(Chunk.read(ReadDataStream(stream)))):
+                stream.seek(index.chunk_start_offset + 9)  # after opcode and length
+                chunk = Chunk.read(ReadDataStream(BytesIO(stream.read(index.chunk_length))))
+                for record in _unpacked(chunk):
+                    number += 1
+                    check_count(number, size)
                     if isinstance(record, Message) and record.channel_id in wanted:
                         topic, kind = wanted[record.channel_id]
                         message = _message(topic, record.log_time, kind, record.data)
@@ -206,11 +199,13 @@ class McapFile:
         channels: dict[int, Channel] = {}
         with self._open() as stream:
             try:
-                limit = LARGEST_CHUNK if self._is_packed else min(self.path.stat().st_size, LARGEST_CHUNK)
+                size, limit = self.path.stat().st_size, limits.LARGEST_UNPACKED
+                limit = limit if self._is_packed else min(size, limit)
                 records = StreamReader(stream, emit_chunks=True, record_size_limit=limit).records
-                for record in chain.from_iterable(
-                    _unpacked(one) if isinstance(one, Chunk) else [one] for one in records
+                for number, record in enumerate(
+                    chain.from_iterable(_unpacked(one) if isinstance(one, Chunk) else [one] for one in records)
                 ):
+                    check_count(number, size)
                     if isinstance(record, Schema):
                         schemas[record.id] = record
                     elif isinstance(record, Channel):
@@ -221,7 +216,7 @@ class McapFile:
                             type_name = schemas[channel.schema_id].name
                             yield _message(printable(channel.topic), record.log_time, type_name, record.data)
             except _DAMAGE as error:
-                self._fault = str(error) or type(error).__name__
+                self._fault = one_line(error)
 
 
 def _in_order(messages: Iterable[PlacedMessage]) -> Iterator[RawMessage]:
@@ -230,10 +225,10 @@ def _in_order(messages: Iterable[PlacedMessage]) -> Iterator[RawMessage]:
     held = 0
     for bound_ns, place, message in messages:
         heapq.heappush(waiting, (message.log_ns, place, message))
-        held += len(message.data)
+        held += len(message.data) + EACH
         while waiting and (waiting[0][0] < bound_ns or held > MOST_WAITING):
             first = heapq.heappop(waiting)[2]
-            held -= len(first.data)
+            held -= len(first.data) + EACH
             yield first
     while waiting:
         yield heapq.heappop(waiting)[2]
@@ -244,53 +239,54 @@ def _message(topic: str, log_ns: int, kind: str, data: bytes) -> RawMessage:
     return RawMessage(topic, log_ns, kind, unpack("zstd", data) if data[:4] == _ZSTD else data)
 
 
-def _unpacked(chunk: Chunk) -> Iterable[McapRecord]:
-    """Return the records of a chunk; raise a `ValueError` if it is larger than `LARGEST_CHUNK`."""
-    _check_chunk(chunk.uncompressed_size, chunk.compression, chunk.data[:18])
-    if chunk.compression == "lz4":
-        chunk = replace(chunk, compression="", data=unpack("lz4", chunk.data))
-    return breakup_chunk(chunk)
-
-
-def _check_chunks(path: Path, indexes: Collection[ChunkIndex]) -> None:
-    """Raise a `ValueError` if a chunk, by its own header or the index, lies outside of the file or is too large."""
-    size = path.stat().st_size
-    with path.open("rb") as stream:
-        for index in indexes:
-            if index.chunk_start_offset + index.chunk_length > size or index.chunk_length > LARGEST_CHUNK:
-                raise ValueError("a chunk lies beyond the end")
-            stream.seek(index.chunk_start_offset + 9)  # after opcode and length
-            head = stream.read(_CHUNK_HEAD)
-            (claimed,) = struct.unpack_from("<Q", head, 16)
-            (letters,) = struct.unpack_from("<I", head, 28)
-            compression = head[32 : 32 + letters].decode("ascii", "replace") if letters < 8 else "?"
-            _check_chunk(max(claimed, index.uncompressed_size), compression, head[40 + letters :])
-
-
-def _check_chunk(claimed: int, compression: str, start: bytes) -> None:
-    if compression == "zstd":  # the frame repeats the size, and the decompressor uses that
-        claimed = max(claimed, frame_content_size(start))
-    if claimed > LARGEST_CHUNK:
-        raise ValueError(f"a chunk states {claimed} bytes")
+def _unpacked(chunk: Chunk) -> Iterator[McapRecord]:
+    """Yield the records of a chunk; raise a `ValueError` if it unpacks to too much."""
+    check_size(chunk.uncompressed_size, "a chunk")
+    content = unpack(chunk.compression, chunk.data)
+    stream = ReadDataStream(BytesIO(content))
+    while stream.count < len(content):
+        kind, length = stream.read1(), stream.read8()
+        match kind:
+            case Opcode.MESSAGE:
+                yield Message.read(stream, length)
+            case Opcode.CHANNEL:
+                yield Channel.read(stream)
+            case Opcode.SCHEMA:
+                yield Schema.read(stream)
+            case _:
+                stream.read(length)
 
 
 _LIMITED: dict[Any, Any] = {bz2.decompress: partial(unpack, "bz2"), lz4.frame.decompress: partial(unpack, "lz4")}
 """Decompressors of chunks, and those with a limit that replace them."""
 
 
+def _limit_values(connection: apsw.Connection) -> None:
+    """Let a db3 file, which rosbags opens, give no value above the limit."""
+    connection.limit(apsw.SQLITE_LIMIT_LENGTH, limits.LARGEST_UNPACKED)
+
+
+apsw.connection_hooks.append(_limit_values)
+
+
 class RosbagsFile:
-    """A folder of ROS 2, a db3 file, or a ROS 1 bag.
+    """A db3 file, which may be compressed as a whole (`.db3.zstd`), or a ROS 1 bag.
 
     Messages of ROS 1 are converted to ROS 2; types without a counterpart are left out.
     """
 
     def __init__(self, path: Path, ros1: bool = False) -> None:
-        self.path = path
+        self.path = self._opened = path
+        if path.suffix in PACKED:
+            self._folder = TemporaryDirectory(prefix="umf_ros_")  # deleted with this object
+            self._opened = Path(self._folder.name, path.stem)
+            with PackedFile(path) as stream, self._opened.open("wb") as file:
+                copyfileobj(stream, file)
         self._reader: Any = Reader1 if ros1 else Reader2
         self._to_cdr = message_types().ros1_to_cdr if ros1 else None
         self.warning = _warning_of_log(path)
         self.counts = Counter[str]()
-        with self._reader(path) as reader:
+        with self._reader(self._opened) as reader:
             connections = self._readable(reader)
             self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
         self.types = {printable(connection.topic): connection.msgtype for connection in connections}
@@ -299,14 +295,17 @@ class RosbagsFile:
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield messages of some topics in the order of their recording."""
-        with self._reader(self.path) as reader:
+        with self._reader(self._opened) as reader:
             wanted = [connection for connection in self._readable(reader) if printable(connection.topic) in topics]
             for place, chunk in getattr(reader, "chunks", {}).items():  # of ROS 1
                 limited = _LIMITED.get(chunk.decompressor, chunk.decompressor)
                 reader.chunks[place] = chunk._replace(decompressor=limited)
-            for connection, log_ns, data in reader.messages(wanted) if wanted else ():
-                cdr = bytes(self._to_cdr(data, connection.msgtype)) if self._to_cdr else data
-                yield _message(printable(connection.topic), log_ns, connection.msgtype, cdr)
+            try:
+                for connection, log_ns, data in reader.messages(wanted) if wanted else ():
+                    cdr = bytes(self._to_cdr(data, connection.msgtype)) if self._to_cdr else data
+                    yield _message(printable(connection.topic), log_ns, connection.msgtype, cdr)
+            except apsw.TooBigError:
+                raise ValueError(f"a message has more than {limits.LARGEST_UNPACKED / 1e6:.4g} MB") from None
 
     def _readable(self, reader: Any) -> list[Connection]:
         known = message_types().fielddefs
@@ -344,7 +343,7 @@ def open_files(path: Path) -> list[RecordedFile]:
         raise BagError(f"{path} is empty")
     if start.startswith(_MCAP) or (start.startswith(_ZSTD) and ".mcap" in path.suffixes):
         return [McapFile(path)]
-    if start.startswith((_SQLITE, _ROS1)):
+    if start.startswith((_SQLITE, _ROS1)) or (start.startswith(_ZSTD) and ".db3" in path.suffixes):
         return [RosbagsFile(path, ros1=start.startswith(_ROS1))]
     raise BagError(f"{path} is not a recording: neither mcap nor db3 nor a ROS 1 bag")
 
@@ -353,11 +352,9 @@ def _open_folder(path: Path) -> list[RecordedFile]:
     """Open all files of a folder, or those of folders in it, whatever its metadata list: recorders are killed."""
     inside = [file for one in sorted(path.iterdir()) if one.is_dir() for file in _files_of(one)]
     paths = _in_number_order(_files_of(path) or inside)
-    if not paths and (path / "metadata.yaml").is_file():  # db3 files that are compressed as a whole
-        return [RosbagsFile(path)]
     if not paths:
-        raise BagError(f"{path} is not a recording: it holds neither metadata.yaml nor mcap or db3 files")
-    files = [RosbagsFile(one) if one.suffix == ".db3" else McapFile(one) for one in paths]
+        raise BagError(f"{path} is not a recording: it holds neither mcap nor db3 files")
+    files = [RosbagsFile(one) if ".db3" in one.suffixes else McapFile(one) for one in paths]
     folders = dict.fromkeys(file.path.parent for file in files)
     if len(folders) > 1 and all(len({file.path.parent for file in group}) == 1 for group in _overlapping(files)):
         names = ", ".join(str(one) for one in folders)
@@ -366,7 +363,8 @@ def _open_folder(path: Path) -> list[RecordedFile]:
 
 
 def _files_of(folder: Path) -> list[Path]:
-    found = [one for kind in ("mcap", "db3", "mcap.zst*") for one in folder.glob(f"*.{kind}") if one.is_file()]
+    kinds = "mcap", "db3", "mcap.zst*", "db3.zst*"
+    found = [one for kind in kinds for one in folder.glob(f"*.{kind}") if one.is_file()]
     plain = {one.name for one in found}
     return [one for one in found if one.name.removesuffix(one.suffix) not in plain]  # unpacked beside
 
@@ -486,10 +484,27 @@ def decode(raw: RawMessage) -> Any:
         MessageError: of kind "undecodable" when the bytes are not a message of its type.
     """
     try:
+        check_size(_size_of_objects(raw), "a message", _MOST_OBJECTS)
         return message_types().deserialize_cdr(raw.data, raw.type)
     except Exception as error:  # damaged bytes raise any exception
         cause = one_line(error)
         raise MessageError("undecodable", f"message does not match its type {raw.type} ({cause})") from None
+
+
+_MOST_OBJECTS = 2**23
+"""Most bytes of a message that become an object for each item, such as a point of Livox: 20 times as much memory."""
+
+
+def _size_of_objects(raw: RawMessage) -> int:
+    """Return the bytes of a message that become objects: all, of a cloud those of its fields, of an image none."""
+    if raw.type in (IMAGE, COMPRESSED):
+        return 0
+    if raw.type != CLOUD:
+        return len(raw.data)
+    order = "<" if raw.data[1] & 1 else ">"
+    (letters,) = struct.unpack_from(order + "I", raw.data, 12)  # of the frame, after 4 bytes of CDR and the stamp
+    (fields,) = struct.unpack_from(order + "I", raw.data, (letters + 19) // 4 * 4 + 8)
+    return int(fields * 16)
 
 
 def open_bag(path: str | Path) -> Bag:

@@ -70,7 +70,7 @@ def read_tum(path: str | Path) -> Trajectory:
 
 def _named_columns(line: str) -> list[int] | None:
     """Return the columns of stamp, x, y, z, qx, qy, qz, qw in a line of their names; None of other lines."""
-    names = [re.sub("[^a-z]", "", name) for name in _split(re.sub(r"\[.*?\]|^\s*[#%]", "", line.lower()))]
+    names = [re.sub("[^a-z]", "", name) for name in _split(re.sub(r"\[[^][]*\]|^\s*[#%]", "", line.lower()))[:100]]
     times = [k for k, name in enumerate(names) if name == "t" or name.startswith(("time", "stamp", "sec"))]
     places = [[k for k, name in enumerate(names) if name[:1] != "q" and name.endswith(axis)] for axis in "xyz"]
     turns = [[k for k, name in enumerate(names) if name[:1] == "q" and name.endswith(axis)] for axis in "xyzw"]
@@ -81,7 +81,7 @@ def _named_columns(line: str) -> list[int] | None:
 def _split(line: str) -> list[str]:
     if re.search(r"\d,\d", line) and (";" in line or len(line.split()) > 3):
         line = line.replace(",", ".")  # decimal commas
-    return re.split(r"\s*[,;]\s*|\s+", line.strip(" \t,;"))
+    return re.split(" ?[,;] ?| ", " ".join(line.strip(" \t\r\n,;").split()))
 
 
 def _as_trajectory(path: str | Path, found: list[tuple[int, Decimal, list[float]]], is_named: bool) -> Trajectory:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import csv
 import fcntl
 import logging
@@ -23,6 +22,7 @@ from typing import Any
 import yaml
 
 from umf_ros.core.errors import ConfigError, OutputError, UmfError, one_line, reading, shortened, writing
+from umf_ros.core.limits import LARGEST_UNPACKED, lines_of, read_text
 
 _log = logging.getLogger(__name__)
 NO_LOCKS = "is on a file system that does not support file locks"
@@ -51,16 +51,14 @@ def atomic_write(path: Path, *kinds: type[Exception]) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
-def read_lines(path: str | Path, kind: type[UmfError]) -> list[str]:
-    """Return lines of a text file in UTF-8, or in UTF-16 with a byte-order mark.
+def read_lines(path: str | Path, kind: type[UmfError]) -> Iterator[str]:
+    """Yield the lines of a text file in UTF-8, or in UTF-16 with a byte-order mark.
 
     Raises:
-        kind: the file cannot be read or is not text.
+        kind: the file cannot be read or is not text, or a line is too long.
     """
     with reading(path, kind, "is not a text file"):
-        data = Path(path).read_bytes()
-        encoding = "utf-16" if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
-        return data.decode(encoding).splitlines()
+        yield from lines_of(path)
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -216,6 +214,7 @@ class SqliteFile:
         self._lock: int | None = None
         self._options = ""
         self.connection = self._connect(schema)
+        self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_UNPACKED)
         try:
             self._check_plain()
             self._open(schema, check)
@@ -391,9 +390,10 @@ def _letters(statement: str) -> str:
     return "".join(letter for letter in statement if letter not in '"`[] \n\t').lower()
 
 
-LARGEST_YAML = 2**22
-MOST_NODES = 100_000
-"""Most nodes of a file; settings have some hundreds, and nested aliases expand a small file to billions."""
+MOST_NODES, DEEPEST = 100_000, 100
+"""Most nodes and levels of nesting of a file; settings have some hundreds on five levels, and nested aliases expand a
+small file to billions."""
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # in C, twenty times as fast
 
 
 def read_yaml(path: Path) -> Any:
@@ -403,12 +403,13 @@ def read_yaml(path: Path) -> Any:
         ConfigError: the file cannot be read.
     """
     with reading(path, ConfigError, "is not valid YAML"):
-        with path.open(encoding="utf-8") as file:  # it may be a pipe, whose size is unknown
-            text = file.read(LARGEST_YAML + 1)
-        if len(text) > LARGEST_YAML:
-            raise ValueError(f"larger than {LARGEST_YAML >> 20} MB")
-        _count_nodes(yaml.compose(text, yaml.SafeLoader), {})
-        return yaml.safe_load(text)
+        text, depth = read_text(path), 0
+        for number, event in enumerate(yaml.parse(text, _Loader)):  # the loader in C overflows its stack where it nests
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST or number > MOST_NODES:
+                raise ValueError(f"more than {DEEPEST} levels of nesting, or {MOST_NODES} nodes")
+        _count_nodes(yaml.compose(text, _Loader), {})
+        return yaml.load(text, _Loader)
 
 
 def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:

@@ -9,7 +9,6 @@ import hashlib
 import os
 import sys
 import threading
-import zipfile
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, WeightsError, reading
+from umf_ros.core.limits import open_archive
 from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.inputs import blank_input
 from umf_ros.networks.config import XFEAT_OUTPUTS, read_config
@@ -59,7 +59,7 @@ class OpenVinoRuntime:
     def __init__(self, weights: Path, outputs: tuple[str, ...], threads: int) -> None:
         path = weights.with_suffix(MODEL_SUFFIX)
         with reading(path, WeightsError, "is damaged"):
-            with zipfile.ZipFile(path) as archive:
+            with open_archive(path) as archive:
                 model = openvino_core().read_model(archive.read("model.xml"), archive.read("model.bin"))
             self.precision, made_from = (model.get_rt_info([FACTS, name]).value for name in ("precision", "weights"))
         if made_from != hashlib.sha256(weights.read_bytes()).hexdigest():

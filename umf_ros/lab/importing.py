@@ -16,11 +16,12 @@ import cv2
 import numpy as np
 
 from umf_ros.bags.trajectories import read_tum
+from umf_ros.core import limits
 from umf_ros.core.geometry import Array, from_quaternion, invert
 from umf_ros.core.io import read_yaml
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.lab.imported import OPTICAL, Imported, pose_entry
-from umf_ros.lab.scan_files import IMAGE_SUFFIXES, SUFFIXES, SensorFileError, read_image, read_scan
+from umf_ros.lab.scan_files import IMAGE_SUFFIXES, SUFFIXES, SensorFileError, read_image, read_picture, read_scan
 from umf_ros.sensors.decode import Cloud
 
 
@@ -37,10 +38,11 @@ def lines_of(path: Path) -> list[str]:
         SensorFileError: it cannot be read.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SensorFileError(f"cannot read {path}: {getattr(error, 'strerror', None) or 'no text'}") from None
-    return [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        return [line.strip() for line in limits.lines_of(path) if line.strip() and not line.lstrip().startswith("#")]
+    except UnicodeDecodeError:
+        raise SensorFileError(f"cannot read {path}: no text") from None
+    except (OSError, ValueError) as error:
+        raise SensorFileError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def numbers_of(path: Path, separator: str | None = None) -> Array:
@@ -97,8 +99,8 @@ def depth_of(path: Path) -> Array:
     Raises:
         SensorFileError: it is none.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 2:
+    image = read_picture(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2:
         raise SensorFileError(f"{path} is no depth image")
     return np.asarray(image, float)
 
@@ -312,13 +314,12 @@ def _export_calibration(path: Path) -> tuple[Array, float]:
         SensorFileError: the file is missing, cut or of other content.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        storage = cv2.FileStorage(limits.read_text(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         fx, fy, cx, cy, baseline = (
             storage.getNode(name).real()
             for name in ("Camera0.fx", "Camera0.fy", "Camera0.cx", "Camera0.cy", "Stereo.bf")
         )
-    except (OSError, UnicodeDecodeError, cv2.error, SystemError):
+    except (OSError, ValueError, cv2.error, SystemError):
         raise SensorFileError(f"{path} is no calibration of an export: it cannot be read") from None
     if fx <= 0 or fy <= 0 or not 0.02 <= baseline <= 1:
         raise SensorFileError(f"{path}: fx {fx:.4g} px and a baseline of {baseline:.4g} m: expected pixels and metres")

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 import struct
+from array import array
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.errors import UmfError, either, one_line
+from umf_ros.core import limits
+from umf_ros.core.errors import UmfError, either, one_line, reading
 from umf_ros.core.frames import Frame, Image, StereoCamera
+from umf_ros.core.limits import check_size, picture_bytes
 from umf_ros.sensors.assembly import Anchor, OdometryBuffer, ScanLimits, assemble
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import FURTHEST_RETURN_M, Cloud, decode_picture, real_returns
@@ -31,6 +37,10 @@ class SensorFileError(UmfError):
 Columns = dict[str, NDArray[Any]]
 Record = np.dtype[Any]
 
+LARGEST_SCAN = 2**29
+"""Most bytes of a file of a scan: 30 million points."""
+LONGEST_HEADER, PARSED_AT_ONCE = 2**16, 2**20
+"""Most bytes of the header of a PCD or PLY file, and bytes of numbers in text that are parsed at once."""
 MOST_READABLE = 0.9
 """Share of the points of a text that have to be readable: raw bytes may hold line ends."""
 MOST_STRETCH = 0.01
@@ -68,6 +78,7 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
     if suffix not in SUFFIXES:
         raise SensorFileError(f"{path} is no scan: expected {either(SUFFIXES)}")
     try:
+        check_size(path.stat().st_size, "it", LARGEST_SCAN)
         content = path.read_bytes()
         columns = _parse_bin(content, bin_columns) if suffix == ".bin" else _PARSERS[suffix](content)
         missing = [axis for axis in "xyz" if axis not in columns]
@@ -95,14 +106,16 @@ def parse_pcd(content: bytes) -> Columns:
         SensorFileError: it is no such file, or the data are not what the header says.
     """
     entries: dict[str, list[str]] = {}
-    body = content
+    start, header = 0, content[:LONGEST_HEADER]
     while "DATA" not in entries:
-        line, end, body = body.partition(b"\n")
-        if not end:
-            raise SensorFileError("a PCD file without a DATA line")
-        words = line.decode("ascii", "replace").split()
+        end = header.find(b"\n", start)
+        if end < 0:
+            raise SensorFileError(f"a PCD file without a DATA line in its first {LONGEST_HEADER >> 10} kB")
+        words = header[start:end].decode("ascii", "replace").split()
+        start = end + 1
         if words and not words[0].startswith("#"):
             entries[words[0].upper()] = words[1:]
+    body = content[start:]
     try:
         record, kind = _pcd_record(entries), entries["DATA"][0].lower()
         points = int(entries.get("POINTS", ["0"])[0])
@@ -131,7 +144,8 @@ def _pcd_record(entries: dict[str, list[str]]) -> Record:
     names = [name.lower() for name in entries.get("FIELDS", entries.get("COLUMNS", []))]
     if not names:
         raise SensorFileError("a PCD file without FIELDS")
-    unique = [name if names.count(name) == 1 else f"{name}{number}" for number, name in enumerate(names)]
+    times = Counter(names)
+    unique = [name if times[name] == 1 else f"{name}{number}" for number, name in enumerate(names)]
     sizes, kinds, counts = (
         entries.get(key, [default] * len(names)) for key, default in (("SIZE", "4"), ("TYPE", "F"), ("COUNT", "1"))
     )
@@ -167,28 +181,52 @@ def _parse_text(body: bytes, record: Record, points: int) -> Columns:
     """
     names = list(record.names or ())
     widths = [int(np.prod(record[name].shape)) for name in names]
+    _check_numbers(body.count(b"\n") * sum(widths), body)
     try:
-        numbers = np.array(body.decode("ascii").split(), dtype=np.float64)
+        numbers = _numbers_in(body)
         whole = len(numbers) // sum(widths)
         rows = numbers[: whole * sum(widths)].reshape(-1, sum(widths))[: points or whole]
         _check_whole(whole, points)
     except ValueError:
         last = max((names.index(name) for name in "xyz" if name in names), default=-1) + 1
         widths = widths[:last]
-        rows = np.array(_leading_numbers(body, sum(widths)))
+        rows = _leading_numbers(body, sum(widths))
         if not len(rows) or len(rows) < MOST_READABLE * points:
             raise SensorFileError("data that are not numbers") from None
     parts = np.split(rows, np.cumsum(widths)[:-1], axis=1)
     return {name: part[:, 0] if part.shape[1] == 1 else part for name, part in zip(names, parts, strict=False)}
 
 
-def _leading_numbers(body: bytes, width: int) -> list[list[float]]:
-    """So many numbers at the start of each line; lines that begin otherwise are left out."""
-    rows: list[list[float]] = []
-    for line in body.split(b"\n"):
+def _numbers_in(body: bytes) -> NDArray[np.float64]:
+    """Return all numbers of a text, which is parsed part by part: words take twenty times as much memory."""
+    space, parts, start, number = re.compile(rb"\s"), [np.empty(0)], 0, 0
+    while start < len(body):
+        gap = space.search(body, start + PARSED_AT_ONCE)
+        end = gap.start() if gap else len(body)
+        parts.append(np.array(body[start:end].decode("ascii").split(), np.float64))
+        start, number = end, number + len(parts[-1])
+        _check_numbers(number, body)
+    return np.concatenate(parts)
+
+
+def _check_numbers(number: int, body: bytes) -> None:
+    if 8 * number > _most(body):
+        raise SensorFileError(f"text of {number} numbers or more: split it, or write it in binary")
+
+
+def _leading_numbers(body: bytes, width: int) -> NDArray[np.float64]:
+    """So many numbers at the start of each line, (N, width); lines that begin otherwise are left out."""
+    found = array("d")
+    for line in io.BytesIO(body) if width else ():
         with suppress(ValueError):
-            rows.append([float(word) for word in line.split(maxsplit=width)[:width]])
-    return [row for row in rows if len(row) == width > 0]
+            row = [float(word) for word in line.split(maxsplit=width)[:width]]
+            found.extend(row if len(row) == width else ())
+    return np.frombuffer(found).reshape(-1, max(1, width))
+
+
+def _most(packed: bytes) -> int:
+    """Return how many bytes text or LZF may unpack to; a number in text has eight characters."""
+    return limits.LARGEST_UNPACKED + len(packed)
 
 
 def _decompress(body: bytes) -> bytes:
@@ -196,8 +234,9 @@ def _decompress(body: bytes) -> bytes:
     found = bytearray()
     try:
         packed_size, size = struct.unpack_from("<II", body)
+        check_size(size, "PCD data", _most(body))
         packed, at = body[8 : 8 + packed_size], 0
-        while at < len(packed):
+        while at < len(packed) and len(found) <= size:
             control, at = packed[at], at + 1
             if control < 32:  # so many bytes and one more as they are
                 found += packed[at : at + control + 1]
@@ -214,7 +253,7 @@ def _decompress(body: bytes) -> bytes:
     except (IndexError, struct.error):
         raise SensorFileError("PCD data that break off") from None
     if len(found) != size:
-        raise SensorFileError(f"PCD data of {len(found)} bytes, {size} expected")
+        raise SensorFileError(f"PCD data of {len(found)} bytes or more, {size} expected")
     return bytes(found)
 
 
@@ -226,10 +265,11 @@ def parse_ply(content: bytes) -> Columns:
     """
     if not content.startswith(b"ply"):
         raise SensorFileError("no PLY file")
-    header, _, rest = content.partition(b"end_header")
-    _, end, body = rest.partition(b"\n")
-    if not end:
-        raise SensorFileError("a PLY header that breaks off")
+    header = content[:LONGEST_HEADER].partition(b"end_header")[0]
+    start = content.find(b"\n", len(header), LONGEST_HEADER) + 1
+    if not start:
+        raise SensorFileError(f"a PLY header that breaks off, or has more than {LONGEST_HEADER >> 10} kB")
+    body = content[start:]
     try:
         form, elements = _parse_ply_header(header.decode("ascii", "replace"))
     except (ValueError, IndexError, KeyError):
@@ -240,12 +280,16 @@ def parse_ply(content: bytes) -> Columns:
     count = elements[at][1]
     if form == "ascii":
         skipped = sum(number for _, number, _ in elements[:at])
-        lines = [line for line in body.splitlines() if line.strip()][skipped : skipped + count]
-        if len(lines) < count:
-            raise SensorFileError(f"PLY data that break off before {count} vertices")
-        if {len(line.split()) for line in lines} - {len(elements[at][2])}:
-            raise SensorFileError("PLY data whose rows do not fit the header")
-        return _parse_text(b"\n".join(lines), _ply_record(elements[at], form), count)
+        lines = islice((line for line in io.BytesIO(body) if line.strip()), skipped, skipped + count)
+        kept, width = io.BytesIO(), len(elements[at][2])
+        for line in lines:
+            if len(line.split(maxsplit=width)) != width:
+                raise SensorFileError("PLY data whose rows do not fit the header")
+            kept.write(line)
+            count -= 1
+        if count > 0:
+            raise SensorFileError(f"PLY data that break off before {elements[at][1]} vertices")
+        return _parse_text(kept.getvalue(), _ply_record(elements[at], form), elements[at][1])
     start = sum(one[1] * _ply_record(one, form).itemsize for one in elements[:at] if one[1])
     record = _ply_record(elements[at], form)
     if len(body) < start + count * record.itemsize:
@@ -287,7 +331,7 @@ MOST_COLUMNS = 32
 
 def _parse_npy(content: bytes) -> Columns:
     array = None
-    with suppress(ValueError, EOFError, OSError):
+    with suppress(ValueError, EOFError, OSError, MemoryError):
         array = np.load(io.BytesIO(content), allow_pickle=False)
     if not isinstance(array, np.ndarray):
         raise SensorFileError("no array of numbers")
@@ -329,8 +373,27 @@ def read_image(path: Path) -> Image:
         image = decode_picture(path.read_bytes())
     except OSError as error:
         raise SensorFileError(f"cannot read {path}: {error.strerror}") from None
+    except ValueError as error:
+        raise SensorFileError(f"{path}: {error}") from None
     if image is None:
         raise SensorFileError(f"{path} is no image")
+    return image
+
+
+def read_picture(path: Path, flags: int = cv2.IMREAD_GRAYSCALE) -> NDArray[Any]:
+    """What OpenCV reads of a file that is no camera's, (H, W) or (H, W, C).
+
+    Raises:
+        SensorFileError: it cannot be read, is no picture, or is too large.
+    """
+    content, image = b"", None
+    with reading(path, SensorFileError, "cannot be read as an image"):
+        content = path.read_bytes()
+        wanted = picture_bytes(content)
+        check_size(wanted, "it")
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if wanted else None
+    if image is None:
+        raise SensorFileError(f"{path} cannot be read as an image")
     return image
 
 

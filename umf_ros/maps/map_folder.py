@@ -19,6 +19,7 @@ from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import OutputError, UmfError, reading, writing
 from umf_ros.core.frames import State
 from umf_ros.core.io import inside, plain_name, write_atomically
+from umf_ros.core.limits import read_json
 from umf_ros.places.database import PLACES_OF_MAP
 from umf_ros.runs.run_file import RunFile
 from umf_ros.sensors.decode import OdometrySample
@@ -79,7 +80,7 @@ class MapFolder:
             raise UmfError(f"{path} is not a map: map.json is missing; make one with umf map")
         folder = cls(path)
         with reading(path / "map.json", UmfError, "is damaged"):
-            content = json.loads((path / "map.json").read_text(encoding="utf-8"))
+            content = read_json(path / "map.json")
             if content["schema"] != SCHEMA_VERSION:
                 raise UmfError(f"{path} is from another version of umf_ros; rebuild the map from its recordings")
             sessions = json.dumps(content["sessions"])
@@ -153,7 +154,7 @@ class MapFolder:
         if not (self.path / EDITS).is_file():
             return {}
         with reading(self.path / EDITS, UmfError, "is damaged"):
-            rows = json.loads((self.path / EDITS).read_text(encoding="utf-8"))
+            rows = read_json(self.path / EDITS)
             return {(int(row["match"]), int(row["query"])): State(row["decision"]) for row in rows}
 
     def write_edits(self, edits: Mapping[tuple[int, int], State]) -> None:

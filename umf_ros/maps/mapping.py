@@ -15,7 +15,6 @@ A recording or map that cannot be read raises an `UmfError`, a folder that canno
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
@@ -34,6 +33,7 @@ from umf_ros.core.config import Database, Settings, Verification
 from umf_ros.core.errors import BagError, UmfError, writing
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.core.io import lock_file, write_table
+from umf_ros.core.limits import read_json
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.maps.joint_graph import solve
@@ -309,7 +309,7 @@ def grow(map_folder: Path, run: Path) -> tuple[MapSession | None, dict[str, Any]
         new = _new_places(target, run)
         session = _add_run(target, run, new) if len(new) >= FEWEST else None
         if session is None and _is_solved(target):
-            return None, json.loads((target.path / "summary.json").read_text(encoding="utf-8"))
+            return None, read_json(target.path / "summary.json")
         return session, write_results(target, solve(target))
     finally:
         os.close(lock)
@@ -353,7 +353,7 @@ def _add_run(target: MapFolder, run: Path, new: list[Keyframe]) -> MapSession:
 def _is_solved(target: MapFolder) -> bool:
     """Whether the results of a map are about all of its sessions."""
     try:
-        summary = json.loads((target.path / "summary.json").read_text(encoding="utf-8"))
+        summary = read_json(target.path / "summary.json")
         return [one["name"] for one in summary["sessions"]] == [one.name for one in target.sessions]
     except (OSError, ValueError, KeyError, TypeError):
         return False

@@ -19,6 +19,7 @@ from umf_ros.core.config import TerrainSettings
 from umf_ros.core.errors import UmfError, reading, writing
 from umf_ros.core.geometry import Array, evenly, first_of_cubes, invert, transform
 from umf_ros.core.io import atomic_write, write_atomically, write_table
+from umf_ros.core.limits import read_json
 from umf_ros.core.trajectory import Trajectory, write_geojson, write_tum
 from umf_ros.localizer import POSES, read_poses
 from umf_ros.maps.joint_graph import JointMap, JointSession
@@ -249,7 +250,7 @@ def export_terrain(folder: MapFolder, settings: TerrainSettings, out: Path) -> s
     solved, voxels = read_poses(folder.path), VoxelMap(settings.cell_m)
     voxels.add(gather(folder, Poses(zip(solved.stamps_ns.tolist(), solved.poses, strict=True)))[0])
     with reading(folder.path / "summary.json", UmfError, "is damaged"):
-        world = json.loads((folder.path / "summary.json").read_text(encoding="utf-8")).get("world")
+        world = read_json(folder.path / "summary.json").get("world")
     placed = None if world is None else (np.array(world["world_T_map"]), np.array(world["origin"]))
     return write_terrain(out, voxels.points(), settings, placed)
 

@@ -14,6 +14,7 @@ from safetensors import safe_open
 
 from umf_ros.core.config import problems
 from umf_ros.core.errors import WeightsError, reading, shortened
+from umf_ros.core.limits import LARGEST_TEXT, check_size
 from umf_ros.core.resources import find
 
 CELLS = 40
@@ -157,6 +158,8 @@ def open_weights(path: Path, framework: str) -> Iterator[Any]:
     with reading(path, WeightsError, "is truncated or not a safetensors file"):
         if not path.is_file():
             raise WeightsError(f"weights {shortened(path)} do not exist")
+        with path.open("rb") as file:
+            check_size(int.from_bytes(file.read(8), "little"), "its header", LARGEST_TEXT)
         with safe_open(path, framework=framework) as stream:
             yield stream
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from umf_ros.core.errors import OutputError, UmfError, one_line
 from umf_ros.core.frames import Candidate, Keyframe, Points
 from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import atomic_write
+from umf_ros.core.limits import read_json
 from umf_ros.places.store import KeyframeStore, index_path
 
 logger = logging.getLogger(__name__)
@@ -111,7 +111,7 @@ class PlaceDatabase:
             raise UmfError(f"{folder} is not a map: {PLACES_OF_MAP} is missing; make one with umf map")
         places = cls(Database(path=str(path)), embedder, dimension, read_only=True)
         try:
-            sessions = json.loads((folder / "map.json").read_text(encoding="utf-8"))["sessions"]
+            sessions = read_json(folder / "map.json")["sessions"]
             places.listed = range(max((one["first_number"] + one["numbers"] for one in sessions), default=0))
         except (OSError, ValueError, LookupError, TypeError):
             places.close()

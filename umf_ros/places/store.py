@@ -21,6 +21,7 @@ from safetensors.numpy import load, save
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Embedding, Keyframe, LocalFeatures, ScanMotion, StereoCamera, SuperFeatures
 from umf_ros.core.io import Schema, SqliteFile
+from umf_ros.core.limits import LARGEST_TEXT, check_size
 
 SCHEMA = Schema(
     "place database",
@@ -248,6 +249,7 @@ def unpack(blob: bytes) -> Keyframe:
     Raises:
         SafetensorError, ValueError, LookupError, TypeError: the bytes are no such blob.
     """
+    check_size(int.from_bytes(blob[:8], "little"), "its header", LARGEST_TEXT)
     arrays = load(blob)
     for name, shape in _SHAPES.items():
         found = arrays.get(name)

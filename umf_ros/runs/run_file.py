@@ -11,6 +11,7 @@ import sqlite3
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -23,6 +24,7 @@ from umf_ros.core.errors import UmfError, writing
 from umf_ros.core.frames import Candidate, LoopClosure, Points
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.core.io import Schema, SqliteFile, write_table
+from umf_ros.core.limits import LONGEST_LINE
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, ClosureReason, ClosureVerdict, State
 from umf_ros.sensors.decode import OdometrySample
@@ -292,7 +294,7 @@ def read_table(path: Path, parse: Callable[[dict[str, str]], Row]) -> list[Row]:
     """Return the result of `parse` for every row, which is given by column."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
+            reader = csv.DictReader(iter(partial(file.readline, LONGEST_LINE), ""))
             return [parse(row) for row in reader]
     except OSError as error:
         raise UmfError(f"cannot read {path}: {error.strerror}") from None

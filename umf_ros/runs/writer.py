@@ -23,6 +23,7 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, Keyframe
 from umf_ros.core.geometry import Array, evenly, quantize
 from umf_ros.core.io import create_run_folder, memory_mb, write_atomically
+from umf_ros.core.limits import read_json
 from umf_ros.runs.run_file import (
     NAME,
     SCAN_UNIT_M,
@@ -255,7 +256,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         raise UmfError(f"{folder} holds no finished run: summary.json is missing")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except ValueError:
         content = None
     if not isinstance(content, dict) or "closures_published" not in content:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from umf_ros.core.errors import MessageError
 from umf_ros.core.frames import Image, Points, StereoCamera
 from umf_ros.core.geometry import Array, from_quaternion
+from umf_ros.core.limits import check_size, picture_bytes
 from umf_ros.sensors.calibration import LARGEST_IMAGE, SensorWindow
 from umf_ros.sensors.point_times import TIME_NAMES, PointTimes
 
@@ -353,7 +354,10 @@ TYPES: dict[str, tuple[str, ...]] = {
 def _decode_compressed(message: Any, grey: GreyRange | None) -> Image:
     if "compressedDepth" in message.format:
         raise MessageError("compressed", "compressed depth image: name the topic of the camera")
-    image = decode_picture(message.data, grey)
+    try:
+        image = decode_picture(bytes(message.data), grey)
+    except ValueError as error:
+        raise MessageError("size", str(error)) from None
     if image is None:
         raise MessageError("compressed", f"compressed image of format {message.format!r} cannot be read")
     if "bayer" in message.format:  # the raw mosaic was compressed: smooth it as demosaicing would
@@ -365,12 +369,16 @@ def _decode_compressed(message: Any, grey: GreyRange | None) -> Image:
 def decode_picture(content: bytes, grey: GreyRange | None = None) -> Image | None:
     """Return the (H, W) uint8 grey image of a compressed file, in the camera's orientation; None where it is none.
 
-    `grey` as in `decode_image`.
+    `grey` as in `decode_image`; formats that `picture_bytes` does not know are not read.
+
+    Raises:
+        ValueError: it takes too much.
     """
-    data = np.frombuffer(content, np.uint8)
+    wanted = picture_bytes(content)
+    check_size(wanted, "a picture")
     # intrinsics hold for unrotated images
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image: Any = cv2.imdecode(data, flags) if len(data) else None
+    image: Any = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if wanted else None
     if image is not None and image.dtype == np.uint16:
         return (grey or GreyRange()).to_bytes(image)
     return None if image is None or image.dtype != np.uint8 else image

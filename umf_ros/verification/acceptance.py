@@ -7,7 +7,6 @@ the way a person would read it, and none can outvote all others. The weights are
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from umf_ros.core.errors import ConfigError
+from umf_ros.core.limits import read_json
 from umf_ros.core.resources import find
 from umf_ros.verification import constants as const
 from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, RejectReason, kind_of
@@ -195,7 +195,7 @@ def load_acceptance(path: str = "") -> AcceptanceModel:
     """
     file = Path(path) if path else find(SHIPPED)
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = read_json(file)
         models = {kind: _logistic(content["models"][kind], kind) for kind in CRITERIA}
         covariances = {kind: CovarianceModel(**content["covariance"][kind]) for kind in CRITERIA}
         bounds = {

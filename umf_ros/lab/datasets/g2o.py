@@ -81,6 +81,10 @@ class _Line(NamedTuple):
     values: Array
 
 
+MOST_PROBLEMS = 1000
+"""Most malformed lines of a file that are named."""
+
+
 def read_g2o(path: str | Path) -> G2oGraph:
     """Read a graph; a malformed line is skipped and named in `problems`.
 
@@ -99,7 +103,8 @@ def read_g2o(path: str | Path) -> G2oGraph:
         try:
             parsed.append(_parse(number, words))
         except (GraphError, ValueError) as error:
-            graph.problems.append(f"line {number}: {error}")
+            if len(graph.problems) < MOST_PROBLEMS:
+                graph.problems.append(f"line {number}: {error}")
     if ignored:
         graph.notes.append("not used: " + ", ".join(f"{count} x {tag}" for tag, count in ignored.items()))
     _fill(graph, parsed)

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from umf_ros.core.errors import UmfError
@@ -23,6 +22,7 @@ from umf_ros.core.geometry import Array, make_pose
 from umf_ros.lab.datasets.s3li import load_pickle
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.datasets.simulated import RecordedSequence, course, poses_of
+from umf_ros.lab.scan_files import read_picture
 
 POINTS = 4096
 SUBMAP_M = 20.0
@@ -143,8 +143,5 @@ def _read_image(submap: SubmapFile, images: Path, linked: dict[int, list[int]]) 
     """The image nearest in time; None where the submap has none."""
     for stamp in linked.get(submap.stamp, [])[:1]:
         path = images / submap.traversal / f"{stamp}.png"
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise UmfError(f"there is no image {path}, or it is none")
-        return image.astype(np.uint8)
+        return read_picture(path).astype(np.uint8)
     return None

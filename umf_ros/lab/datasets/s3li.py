@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -26,6 +25,7 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.embedding.inputs import shrink
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.lab.datasets.simulated import RecordedSequence, course, detours, path_length, poses_of
+from umf_ros.lab.scan_files import read_picture
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
 Names = Mapping[str, Callable[..., Any]]
@@ -431,8 +431,5 @@ def _read_image(written: Path, folder: Path | None) -> Image:
         places += [folder.joinpath(*written.parts[-count:]) for count in range(min(4, len(written.parts)), 0, -1)]
     for path in places:
         if path.is_file():
-            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            if image is None:
-                raise UmfError(f"{path} is no image")
-            return image.astype(np.uint8)
+            return read_picture(path).astype(np.uint8)
     raise UmfError(f"there is no image {written}" + (f", nor in {folder}" if folder else ""))

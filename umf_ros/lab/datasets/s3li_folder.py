@@ -83,7 +83,7 @@ def read_calde(path: Path) -> StereoFile:
     """
     cameras: dict[str, dict[str, str]] = {}
     try:
-        lines = read_lines(path, BagError)
+        lines = list(read_lines(path, BagError))
     except BagError as error:
         raise CalibrationError(str(error)) from None
     for line in lines:

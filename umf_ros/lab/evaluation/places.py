@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import cv2
 import numpy as np
 from pydantic import Field, ValidationError
 
@@ -19,7 +18,7 @@ from umf_ros.core.io import read_yaml
 from umf_ros.embedding import Embedder, check_inputs, make_embedder
 from umf_ros.lab.evaluation.results import EvaluationReport, Figures, Scores, TextTable, percent, rounded, score
 from umf_ros.lab.evaluation.retrieval import Mask, PlaceCollection, RetrievalTask, rank, rerank_all
-from umf_ros.lab.scan_files import SUFFIXES, read_scan
+from umf_ros.lab.scan_files import SUFFIXES, read_picture, read_scan
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
 IMAGES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
@@ -201,10 +200,7 @@ def _task(positive: Mask) -> RetrievalTask:
 
 
 def _image_frame(file: Path, number: int, calibration: Calibration | None) -> Frame:
-    read = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    if read is None:
-        raise UmfError(f"{file} cannot be read as an image")
-    image: Image = read.astype(np.uint8)
+    image: Image = read_picture(file).astype(np.uint8)
     return _frame(number, _plane(image), calibration, left=_rectified(image, calibration))
 
 
