@@ -32,9 +32,9 @@ test-jazzy: .venv-jazzy/.installed
 	@OMP_NUM_THREADS=1 .venv-jazzy/bin/python $(PYTEST)
 
 # all packages that tests import except the Rerun viewer, which needs NumPy 2
-.venv-jazzy/.installed: $(wildcard requirements*.txt) package.xml setup.py setup.cfg pyproject.toml
+.venv-jazzy/.installed: $(wildcard requirements*.txt) package.xml setup.py setup.cfg pyproject.toml $(wildcard umf_ros/scan/kernels/*)
 	@test -n "$(PYTHON)" || { echo "make: Python 3.11 or 3.12 is needed (set PYTHON=...)" >&2; exit 1; }
-	@./tools/system_packages.sh
+	@PYTHON=$(PYTHON) ./tools/system_packages.sh
 	@test -x .venv-jazzy/bin/python || $(PYTHON) -m venv .venv-jazzy
 	@grep -hv '^-r' requirements-dev.txt requirements-lab.txt requirements-fleet.txt > .venv-jazzy/tools.txt
 	@./tools/install_torch.sh .venv-jazzy/bin/python $(TORCH_INDEX)
@@ -59,9 +59,9 @@ docs: install
 install: $(VENV)/.installed
 
 # requirements in a separate step: they change rarely and take most of the time
-$(VENV)/.installed: $(wildcard requirements*.txt) package.xml setup.py setup.cfg pyproject.toml
+$(VENV)/.installed: $(wildcard requirements*.txt) package.xml setup.py setup.cfg pyproject.toml $(wildcard umf_ros/scan/kernels/*)
 	@test -n "$(PYTHON)" || { echo "make: Python 3.11 or 3.12 is needed (set PYTHON=...)" >&2; exit 1; }
-	@./tools/system_packages.sh
+	@PYTHON=$(PYTHON) ./tools/system_packages.sh
 	@test -x $(BIN)/python || { echo "Making $(VENV) with $$($(PYTHON) --version)"; $(PYTHON) -m venv $(VENV); }
 	@./tools/install_torch.sh $(BIN)/python $(TORCH_INDEX)
 	@echo "Installing the requirements (one to three minutes the first time)"

@@ -17,7 +17,7 @@ python3 -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' || fail "Pyth
 command -v colcon >/dev/null || fail "colcon is missing: sudo apt install python3-colcon-common-extensions"
 
 missing=()
-for package in python3-venv ros-jazzy-common-interfaces ros-jazzy-lifecycle-msgs ros-jazzy-tf2-ros-py ros-jazzy-ros2launch; do
+for package in g++ python3-dev python3-venv ros-jazzy-common-interfaces ros-jazzy-lifecycle-msgs ros-jazzy-tf2-ros-py ros-jazzy-ros2launch; do
   [ "$(dpkg-query -W -f='${db:Status-Status}' "$package" 2>/dev/null)" = installed ] || missing+=("$package")
 done
 if [ ${#missing[@]} -gt 0 ]; then

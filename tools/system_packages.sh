@@ -1,8 +1,12 @@
 #!/usr/bin/env bash
-# Install the system libraries that the lab's wheels need but do not contain: open3d loads libusb-1.0 and libGL. A rover
-# needs none of them. With --browser also Chromium, in which tests open the report.
+# Install the compiler that builds umf_ros/scan/_kernels, and the system libraries that the lab's wheels need but do not
+# contain: open3d loads libusb-1.0 and libGL. With --browser also Chromium, in which tests open the report.
 set -eu
 missing=()
+command -v c++ >/dev/null || missing+=(g++)
+python=$(command -v "${PYTHON:-python3}" || true)
+headers='import os, sys, sysconfig; sys.exit(not os.path.exists(sysconfig.get_paths()["include"] + "/Python.h"))'
+[ -z "$python" ] || "$python" -c "$headers" || missing+=("$("$python" -c 'import sys; print("python%d.%d-dev" % sys.version_info[:2])')")
 known=$(ldconfig -p 2>/dev/null || /sbin/ldconfig -p)
 grep -q 'libusb-1\.0\.so' <<<"$known" || missing+=(libusb-1.0-0)
 grep -q 'libGL\.so\.1' <<<"$known" || missing+=(libgl1)

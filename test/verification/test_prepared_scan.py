@@ -15,7 +15,7 @@ from umf_ros.verification.visibility import Sight
 
 GROUND = landscape(20)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
-READY = ("view", "terrain", "range_images", "spacing", "scouts_cloud", "sample_cloud", "cloud", "up")
+READY = ("view", "terrain", "free_space", "spacing", "oriented_scouts", "oriented_sample", "normals", "up")
 
 
 def test_a_scan_is_ready_once_and_forgotten_when_stamps_start_over() -> None:
@@ -69,6 +69,6 @@ def test_the_rays_of_merged_scans_start_where_each_was_taken() -> None:
     merged = PreparedScan(wall.astype(np.float32), np.stack([behind, here]), owner=owner)
     alone = PreparedScan(wall.astype(np.float32), here)
     free = np.array([[-2.0, 0.1, 0.1]])  # between the two places
-    assert merged.look_at(free) == Sight.PASSED and alone.look_at(free) == Sight.HIDDEN
-    assert merged.look_at(wall[:1]) == Sight.MET
-    assert merged.look_at(np.array([[12.0, 0.1, 0.1]])) == Sight.HIDDEN
+    assert merged.free_space.look_at(free) == Sight.PASSED and alone.free_space.look_at(free) == Sight.HIDDEN
+    assert merged.free_space.look_at(wall[:1]) == Sight.MET
+    assert merged.free_space.look_at(np.array([[12.0, 0.1, 0.1]])) == Sight.HIDDEN

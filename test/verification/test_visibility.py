@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from umf_ros.core.geometry import Array, invert, make_pose, transform
-from umf_ros.verification.visibility import FieldOfView, RangeImage, Sight
+from umf_ros.scan._kernels import FreeSpace
+from umf_ros.verification.visibility import FieldOfView, Sight, free_space
 
 RNG = np.random.default_rng(3)
 TURN = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [2.0, 1.0, 0.0])
@@ -51,6 +52,10 @@ def test_all_headings_are_open_to_a_view_all_around() -> None:
     assert fan(360).overlap(fan(70), headings).min() == pytest.approx(1)
 
 
+def rays_of(points: Array) -> FreeSpace:
+    return free_space([points], np.eye(4)[None])
+
+
 def rays(count: int = 40_000, half_width_deg: float = 180.0) -> Array:
     azimuth = np.radians(RNG.uniform(-half_width_deg, half_width_deg, count))
     elevation = np.radians(RNG.uniform(-20, 20, count))
@@ -79,31 +84,31 @@ def passed(sight: NDArray[np.int8]) -> float:
 
 def test_the_same_hall_from_another_pose_contradicts_nothing() -> None:
     here, there = hall(np.eye(4), rays()), hall(TURN, rays())
-    assert passed(RangeImage(here).look_at(transform(TURN, there))) < 0.01
-    assert passed(RangeImage(there).look_at(transform(invert(TURN), here))) < 0.01
+    assert passed(rays_of(here).look_at(transform(TURN, there))) < 0.01
+    assert passed(rays_of(there).look_at(transform(invert(TURN), here))) < 0.01
 
 
 def test_a_wrong_pose_puts_walls_into_free_space() -> None:
     here, there = hall(np.eye(4), rays()), hall(TURN, rays())
     shifted = make_pose(TURN[:3, :3], [4.0, 1.0, 0.0])
-    assert passed(RangeImage(there).look_at(transform(invert(shifted), here))) > 0.1
+    assert passed(rays_of(there).look_at(transform(invert(shifted), here))) > 0.1
 
 
 def test_what_stands_in_free_space_is_passed_and_what_is_gone_was_met_by_nobody() -> None:
     empty, furnished = hall(np.eye(4), rays()), hall(np.eye(4), rays(), pillar=True)
     on_pillar = np.abs(furnished[:, :2] - [5.0, 3.0]).max(axis=1) < 1.01
     assert on_pillar.sum() > 500
-    sight = RangeImage(empty).look_at(furnished)
+    sight = rays_of(empty).look_at(furnished)
     assert (sight[on_pillar] == Sight.PASSED).mean() > 0.99
     assert (sight[~on_pillar] == Sight.MET).mean() > 0.99
     # seen the other way round the wall behind the pillar is only hidden: no contradiction
-    back = RangeImage(furnished).look_at(empty)
+    back = rays_of(furnished).look_at(empty)
     assert (back == Sight.HIDDEN).mean() == pytest.approx(on_pillar.mean(), abs=0.02)
     assert passed(back) < 0.01
 
 
 def test_outside_a_narrow_view_nothing_is_known() -> None:
-    narrow = RangeImage(hall(np.eye(4), rays(half_width_deg=35.0)))
+    narrow = rays_of(hall(np.eye(4), rays(half_width_deg=35.0)))
     points = hall(np.eye(4), rays())
     bearing = np.abs(np.degrees(np.arctan2(points[:, 1], points[:, 0])))
     sight = narrow.look_at(points)
@@ -114,16 +119,16 @@ def test_outside_a_narrow_view_nothing_is_known() -> None:
 def test_the_view_does_not_end_behind_the_sensor() -> None:
     wall = np.column_stack([np.full(900, -5.0), RNG.uniform(-2, 2, 900), RNG.uniform(-1, 1, 900)])
     nearer = 0.6 * wall[np.abs(wall[:, 1]) < 0.3]
-    assert (RangeImage(wall).look_at(nearer) == Sight.PASSED).all()
+    assert (rays_of(wall).look_at(nearer) == Sight.PASSED).all()
 
 
 def test_thinned_points_near_the_sensor_hide_what_lies_behind_them() -> None:
     """Cubes of a quarter of a metre are wider than a cell, two metres away."""
     wall = np.stack(np.meshgrid([2.0], np.arange(-2, 2, 0.25), np.arange(-1, 1, 0.25)), axis=-1).reshape(-1, 3)
     beyond = np.column_stack([np.full(400, 6.0), RNG.uniform(-3, 3, 400), RNG.uniform(-1.5, 1.5, 400)])
-    assert (RangeImage(wall).look_at(beyond) == Sight.HIDDEN).mean() > 0.7
+    assert (rays_of(wall).look_at(beyond) == Sight.HIDDEN).mean() > 0.7
 
 
 def test_the_robot_itself_is_not_looked_at() -> None:
     here = hall(np.eye(4), rays())
-    assert (RangeImage(here).look_at(0.05 * here) == Sight.HIDDEN).all()
+    assert (rays_of(here).look_at(0.05 * here) == Sight.HIDDEN).all()

@@ -18,7 +18,7 @@ from umf_ros.core.config import TerrainSettings
 from umf_ros.core.frames import Points
 from umf_ros.core.geometry import Array, cubes, heading, invert, make_pose, quantize, transform
 from umf_ros.core.trajectory import MAX_GAP_S, Trajectory, bracket
-from umf_ros.verification.visibility import RangeImage, Sight
+from umf_ros.verification.visibility import Sight, free_space
 
 REACH_M = 25.0  # by hand: beyond, points are too sparse to show an alignment
 RAY_M = 20.0  # by hand: up to here rays are denser than voxels
@@ -58,7 +58,7 @@ class VoxelMap:
         means = self._means()
         for number, (points, viewpoint) in enumerate(placed, self.scans):
             if len(points):
-                self._pass_through(RangeImage(points - viewpoint), viewpoint, number, means)
+                self._pass_through(points, viewpoint, number, means)
         self.scans += len(scans)
 
     def points(self) -> Points:
@@ -99,14 +99,15 @@ class VoxelMap:
         self._keys, self._sum = merged, sums
         self._first, self._last, self._count, self._passes = values
 
-    def _pass_through(self, image: RangeImage, viewpoint: Array, number: int, means: Array) -> None:
-        """Count the scan for all voxels that it passes through, of those that were hit before."""
+    def _pass_through(self, points: Array, viewpoint: Array, number: int, means: Array) -> None:
+        """Count a scan (N, 3) for all voxels that it passes through, of those that were hit before."""
         sides = cubes(viewpoint + np.array([[-RAY_M, 0, 0], [RAY_M, 0, 0]]), self.cell_m)
         near = slice(*np.searchsorted(self._keys, sides))
         earlier = near.start + np.flatnonzero(self._last[near] < number)
         offsets = means[earlier] - viewpoint
         inside = np.einsum("ij,ij->i", offsets, offsets) < RAY_M**2
-        passed = image.look_at(offsets[inside]) == Sight.PASSED
+        rays = free_space([points - viewpoint], np.eye(4)[None])
+        passed = rays.look_at(offsets[inside]) == Sight.PASSED
         self._passes[earlier[inside][passed]] += 1
 
     def _free(self) -> NDArray[np.bool_]:

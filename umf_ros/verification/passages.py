@@ -18,8 +18,7 @@ from umf_ros.core.geometry import Array, evenly, invert, near, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur
 from umf_ros.verification.scan_alignment import run_gicp
-from umf_ros.verification.scan_consistency import at_poses, mean_misfits, near_identity, patterned, shifted
-from umf_ros.verification.visibility import Sight
+from umf_ros.verification.scan_consistency import mean_misfits, near_identity, patterned, shifted
 
 Misfits = tuple[Array, NDArray[np.bool_]]
 """(K, N) of points at poses, from 0 on a surface to 1 off all or in space seen empty; and whether they are known."""
@@ -94,10 +93,10 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     best = along[_peaks(_means(*_misfits(match, query, along, const.SCOUT_EVERY)))]
     distinct: list[tuple[Array, Array]] = []
     for one in best:  # half of them end where another does: a few points show it
-        end = run_gicp(match, query.scouts_cloud, one, const.FINE_REACH_M)
+        end = run_gicp(match, query.oriented_scouts, one, const.FINE_REACH_M)
         if not any(near(end, other, const.PASSAGE_SAME_M, np.pi) for _, other in distinct):
             distinct.append((one, end))
-    aligned = [run_gicp(match, query.sample_cloud, one, const.FINE_REACH_M) for one, _ in distinct]
+    aligned = [run_gicp(match, query.oriented_sample, one, const.FINE_REACH_M) for one, _ in distinct]
     poses = np.stack([pose, *aligned, *best])  # alignments may all end at one pose
     misfits, known = _misfits(match, query, poses)
     means = _means(misfits, known)
@@ -126,17 +125,10 @@ def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int 
 
 def _misfits_with(scan: PreparedScan, planes: Surfaces, points: Array, poses: Array, sigma_m: float) -> Misfits:
     """Misfits of points (N, 3) with planes of a scan."""
-    moved = at_poses(poses, points)
-    known = scan.look_at(moved) == Sight.PASSED
-    misfits, others = known.astype(float), np.flatnonzero(~known)
-    moved = moved[others]
-    found, squared = planes.tree.batch_nearest_neighbor_search(moved, num_threads=1)
-    index = np.asarray(found, np.intp)
-    away = np.einsum("ij,ij->i", moved - planes.centres[index], planes.normals[index])
-    sigmas = (away / sigma_m) ** 2
-    misfits[others] = sigmas / (1.0 + sigmas)
-    known[others] = planes.planar[index] & (np.asarray(squared) < planes.reach_m[index] ** 2)
-    return misfits.reshape(len(poses), -1), known.reshape(len(poses), -1)
+    planar = planes.centres, planes.normals, planes.reach_m, planes.planar
+    misfits = scan.free_space.plane_misfits(planes.tree, *planar, points, poses, sigma_m, const.PLANE_REACH_M)
+    known = np.isfinite(misfits)
+    return np.where(known, misfits, 0.0), known
 
 
 def _means(misfits: Array, known: NDArray[np.bool_]) -> Array:

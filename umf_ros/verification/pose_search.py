@@ -28,7 +28,6 @@ from umf_ros.verification.keypoints import common_keypoints
 from umf_ros.verification.prepared_scan import PreparedScan, levelled, structured, submaps, views_decide
 from umf_ros.verification.scan_alignment import run_gicp
 from umf_ros.verification.view_alignment import PairedViews
-from umf_ros.verification.visibility import Sight
 
 
 class Fit(NamedTuple):
@@ -91,8 +90,8 @@ def coarse_align(match: PreparedScan, query: PreparedScan, guesses: Sequence[Arr
     """
     poses = _by_scouts(match, query, guesses)
     reach_m = const.SCOUT_NEAR * query.cell_m
-    there = _found_shares(match, [transform(pose, query.scouts) for pose in poses], reach_m)
-    back = _found_shares(query, [transform(invert(pose), match.scouts) for pose in poses], reach_m)
+    there = _found_shares(match, query.scouts, poses, reach_m)
+    back = _found_shares(query, match.scouts, [invert(pose) for pose in poses], reach_m)
     known = structured(match, query)
     fits = []
     for pose, share in zip(poses, (there + back) / 2, strict=True):
@@ -102,14 +101,13 @@ def coarse_align(match: PreparedScan, query: PreparedScan, guesses: Sequence[Arr
     return fits
 
 
-def _found_shares(scan: PreparedScan, sets: list[Array], reach_m: float) -> Array:
-    """Of each set of points (N, 3) that a scan should see, the share within a reach of its own; less of few points."""
-    if not sets:
+def _found_shares(scan: PreparedScan, points: Array, poses: list[Array], reach_m: float) -> Array:
+    """(K,) of points (N, 3) at poses that a scan should see, the share within a reach of its own; less of few."""
+    if not poses:
         return np.empty(0)
-    points = np.concatenate(sets)
-    seen = (scan.look_at(points) != Sight.HIDDEN).reshape(len(sets), -1)
-    close = (scan.nearest(points)[1] < reach_m**2).reshape(len(sets), -1)
-    shares: Array = (seen & close).sum(axis=1) / np.maximum(seen.sum(axis=1), const.FEWEST_POINTS)
+    points, reaches = np.ascontiguousarray(points), np.full(len(points), reach_m)
+    misfits = scan.free_space.point_misfits(scan.tree, points, reaches, np.stack(poses), 1.0)
+    shares: Array = (misfits < 1.0).sum(axis=1) / np.maximum(np.isfinite(misfits).sum(axis=1), const.FEWEST_POINTS)
     return shares
 
 
@@ -133,7 +131,7 @@ def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[
 
 def _by_scouts(match: PreparedScan, query: PreparedScan, guesses: Sequence[Array]) -> list[Array]:
     """Poses refined by some steps on a few points."""
-    return [run_gicp(match, query.scouts_cloud, guess, const.COARSE_REACH_M) for guess in guesses]
+    return [run_gicp(match, query.oriented_scouts, guess, const.COARSE_REACH_M) for guess in guesses]
 
 
 def _correlate(around: Spectra, turned: Spectra, side: int) -> NDArray[np.float32]:

@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 from zlib import crc32
 
 import numpy as np
-import small_gicp
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Frame, Keyframe, Points, ScanMotion
-from umf_ros.core.geometry import Array, cubes, evenly, invert, make_pose, transform
+from umf_ros.core.geometry import Array, evenly, invert, make_pose, transform
 from umf_ros.core.levelling import upright
+from umf_ros.scan import _kernels as kernels
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import GridMap
 from umf_ros.verification.keypoints import Keypoints, find_keypoints
-from umf_ros.verification.visibility import FieldOfView, RangeImage
+from umf_ros.verification.visibility import FieldOfView, free_space
 
 Indices = NDArray[np.intp]
 
@@ -38,11 +39,21 @@ def thin_frame(frame: Frame) -> tuple[Points, ScanMotion | None]:
 
 def _cell_means(points: Points, values: Points) -> Points:
     """Means (M, C) float32 of values (N, C) over the points (N, 3) nearer than 40 m in every occupied cube."""
-    inside = np.einsum("ij,ij->i", points, points) < const.MAX_RANGE_M**2
-    near, values = points[inside].astype(float), values[inside].astype(float)
-    _, owner, count = np.unique(cubes(near, const.THIN_CELL_M), return_inverse=True, return_counts=True)
-    means = [np.bincount(owner, column) / count for column in values.T]
-    return np.column_stack(means).astype(np.float32)
+    points, values = (np.ascontiguousarray(rows, np.float32) for rows in (points, values))
+    return kernels.cell_means(points, values, const.THIN_CELL_M, const.MAX_RANGE_M)
+
+
+class OrientedPoints(NamedTuple):
+    """Points (N, 3), m, with unit normals (N, 3) that their neighbours among themselves have."""
+
+    points: Array
+    normals: Array
+
+    @classmethod
+    def of(cls, points: Array) -> OrientedPoints:
+        """Give points (N, 3) their normals."""
+        points = np.ascontiguousarray(points)
+        return cls(points, kernels.KdTree(points).normals(2 * const.NEIGHBOURS))
 
 
 @dataclass(frozen=True)
@@ -59,7 +70,7 @@ class Surfaces:
     """
 
     points: Array
-    tree: small_gicp.KdTree
+    tree: kernels.KdTree
     normals: Array
     centres: Array
     reach_m: Array
@@ -69,18 +80,13 @@ class Surfaces:
     def of(cls, points: Array) -> Surfaces:
         """Fit a plane at each of (M, 3) points."""
         points = points if len(points) else np.full((1, 3), 10 * const.MAX_RANGE_M)  # a tree needs a point
-        tree = small_gicp.KdTree(points)
-        index, squared = tree.batch_knn_search(points, const.PLANE_NEIGHBOURS, 1)
-        neighbours = points[np.asarray(index, np.intp)]
-        centres = neighbours.mean(axis=1)
-        offsets = neighbours - centres[:, None]
-        variances, axes = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets / neighbours.shape[1])
-        thickness, width, length = np.sqrt(np.maximum(variances, 0.0)).T
-        reach = np.sqrt(np.asarray(squared)[:, -1])
+        tree = kernels.KdTree(np.ascontiguousarray(points))
+        centres, normals, reach, spread = tree.planes(const.PLANE_NEIGHBOURS)
+        thickness, width, length = spread.T
         even = (thickness < const.PLANE_SIGMA_M) & (4 * thickness < width)
         wide = (width > const.PLANE_WIDTH_M) & (width > const.PLANE_ROUNDNESS * length)
         planar = even & wide & (reach < const.PLANE_REACH_M)
-        return cls(points, tree, axes[:, :, 0], centres, reach, planar)
+        return cls(points, tree, normals, centres, reach, planar)
 
 
 class PreparedScan:
@@ -142,7 +148,7 @@ class PreparedScan:
         """Make at once what a query's scan is asked for in every comparison."""
         if self.usable:
             self.map(self.cell_m)
-            for part in ("view", "terrain", "range_images", "spacing", "scouts_cloud", "sample_cloud"):
+            for part in ("view", "terrain", "free_space", "spacing", "oriented_scouts", "oriented_sample"):
                 getattr(self, part)
 
     @property
@@ -195,43 +201,20 @@ class PreparedScan:
         return find_keypoints(self.terrain.relief)
 
     @cached_property
-    def range_images(self) -> list[RangeImage]:
-        """How far the LiDAR saw from where each of the merged scans was taken."""
-        return [
-            RangeImage(transform(lidar_T_body, self.points[self.owner == number]))
-            for number, lidar_T_body in enumerate(self._lidars_T_body)
-        ]
-
-    def look_at(self, points: Array) -> NDArray[np.int8]:
-        """(N,) what the rays of this scan say of points (N, 3) of its body frame, each a `Sight`.
-
-        Of merged scans those count first that met a point: next to an edge others pass it by.
-        """
-        views = zip(self._lidars_T_body, self.range_images, strict=True)
-        found: NDArray[np.int8] = np.min(
-            [image.look_at(transform(lidar_T_body, points)) for lidar_T_body, image in views], axis=0
-        )
-        return found
+    def free_space(self) -> kernels.FreeSpace:
+        """What the rays of this scan say of points of its body frame."""
+        poses = self._lidars_T_body
+        return free_space([transform(pose, self.points[self.owner == i]) for i, pose in enumerate(poses)], poses)
 
     @cached_property
-    def tree(self) -> small_gicp.KdTree:
+    def tree(self) -> kernels.KdTree:
         """Nearest neighbours among the points."""
-        return small_gicp.KdTree(self.points)
-
-    def nearest(self, points: Array) -> tuple[Indices, Array]:
-        """Index (N,) of the nearest point to each of (N, 3), and its squared distance, m^2."""
-        index, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
-        return np.asarray(index, np.intp), np.asarray(squared)
-
-    @cached_property
-    def cloud(self) -> small_gicp.PointCloud:
-        """Points, normals and covariances."""
-        return _cloud_of(self.points, self.tree)
+        return kernels.KdTree(self.points)
 
     @cached_property
     def normals(self) -> Array:
         """(M, 3) unit normals, zero where the neighbourhood is too small."""
-        return np.asarray(self.cloud.normals())[:, :3]
+        return self.tree.normals(2 * const.NEIGHBOURS)
 
     @cached_property
     def picks(self) -> Indices:
@@ -244,9 +227,9 @@ class PreparedScan:
         return self.points[self.picks]
 
     @cached_property
-    def sample_cloud(self) -> small_gicp.PointCloud:
-        """The sample with covariances of its own."""
-        return _cloud_of(self.sample)
+    def oriented_sample(self) -> OrientedPoints:
+        """The sample with normals of its own."""
+        return OrientedPoints.of(self.sample)
 
     @property
     def scouts(self) -> Array:
@@ -254,21 +237,19 @@ class PreparedScan:
         return self.sample[:: const.SCOUT_EVERY]
 
     @cached_property
-    def scouts_cloud(self) -> small_gicp.PointCloud:
-        """The few with covariances of their own."""
-        return _cloud_of(self.scouts)
+    def oriented_scouts(self) -> OrientedPoints:
+        """The few with normals of their own."""
+        return OrientedPoints.of(self.scouts)
 
     @cached_property
     def spacing(self) -> Array:
         """(S,) m: how far the points of the sample are from the fifth of their neighbours."""
-        _, squared = self.tree.batch_knn_search(self.sample, const.NEIGHBOURS + 1, 1)
-        return np.sqrt(np.asarray(squared)[:, -1])
+        return np.sqrt(self.tree.neighbours(self.sample, const.NEIGHBOURS + 1)[1][:, -1])
 
     @cached_property
     def noise_m(self) -> float:
         """How far the points scatter about their neighbours' planes, m: sensor noise and roughness together."""
-        index, _ = self.tree.batch_knn_search(self.sample, const.NEIGHBOURS, 1)
-        neighbours = np.asarray(index, np.intp)
+        neighbours, _ = self.tree.neighbours(self.sample, const.NEIGHBOURS)
         offsets = self.points[neighbours[:, 1:]] - self.sample[:, None]
         away = np.abs(np.einsum("nki,ni->nk", offsets, self.normals[neighbours[:, 0]]))
         return 1.4826 * float(np.median(away))
@@ -308,13 +289,6 @@ class PreparedScan:
         sums, ways = np.linalg.eigh(level.T @ level)
         way: Array = self.up.T @ np.append(ways[:, 0], 0.0)
         return sums, way
-
-
-def _cloud_of(points: Array, tree: small_gicp.KdTree | None = None) -> small_gicp.PointCloud:
-    """Points (N, 3) with normals and covariances of their own."""
-    cloud = small_gicp.PointCloud(points)
-    small_gicp.estimate_normals_covariances(cloud, tree, 2 * const.NEIGHBOURS, 1)
-    return cloud
 
 
 def levelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:

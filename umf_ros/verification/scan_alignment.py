@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import small_gicp
 from numpy.typing import ArrayLike, NDArray
 
 from umf_ros.core.frames import Keyframe, ScanMotion
 from umf_ros.core.geometry import Array, propagate, skew, transform
+from umf_ros.scan import _kernels as kernels
 from umf_ros.verification import constants as const
-from umf_ros.verification.prepared_scan import PreparedScan
+from umf_ros.verification.prepared_scan import OrientedPoints, PreparedScan
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,30 +97,22 @@ class Alignment:
 
 def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Alignment:
     """Generalised ICP (Segal, RSS 2009) from the pose `guess`, first far-sighted, then near-sighted."""
-    pose = run_gicp(match, query.sample_cloud, guess, const.COARSE_REACH_M)
-    pose = run_gicp(match, query.sample_cloud, pose, const.FINE_REACH_M)
+    pose = run_gicp(match, query.oriented_sample, guess, const.COARSE_REACH_M)
+    pose = run_gicp(match, query.oriented_sample, pose, const.FINE_REACH_M)
     return inspect(match, query, pose)
 
 
-def run_gicp(match: PreparedScan, query: small_gicp.PointCloud, guess: Array, reach_m: float) -> Array:
+def run_gicp(match: PreparedScan, query: OrientedPoints, guess: Array, reach_m: float) -> Array:
     """`match_T_query` after some steps of generalised ICP from a guess; counterparts are nearer than `reach_m`."""
-    result = small_gicp.align(
-        match.cloud,
-        query,
-        match.tree,
-        guess,
-        registration_type="GICP",
-        max_correspondence_distance=reach_m,
-        num_threads=1,
-        max_iterations=const.STEPS,
-    )
-    return np.asarray(result.T_target_source)
+    guess = np.ascontiguousarray(guess)
+    ends = const.STEP_M, const.STEP_RAD
+    return kernels.align(match.tree, match.normals, *query, guess, reach_m, const.STEPS, *ends)
 
 
 def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
     """Residuals, their Jacobian and the overlap of two scans at a pose."""
     moved = transform(pose, query.sample)
-    index, squared = match.nearest(moved)
+    index, squared = match.tree.nearest(moved)
     normals = match.normals[index]
     offset = moved - match.points[index]
     residual = np.einsum("ij,ij->i", offset, normals)

@@ -33,9 +33,9 @@ def compare_scans(match: PreparedScan, query: PreparedScan, pose: Array) -> dict
     """
     blur_m = common_blur(match, query)
     moved, back = transform(pose, query.sample), transform(invert(pose), match.sample)
-    index, squared = match.nearest(moved)
-    sights = match.look_at(moved), query.look_at(back)
-    distances = np.sqrt(squared), np.sqrt(query.nearest(back)[1])
+    index, squared, of_query = match.free_space.observe(match.tree, moved)
+    _, squared_back, of_match = query.free_space.observe(query.tree, back)
+    sights, distances = (of_query, of_match), (np.sqrt(squared), np.sqrt(squared_back))
     reaches = counterpart_reach(query.spacing, blur_m), counterpart_reach(match.spacing, blur_m)
     stands = _upright(match, index), _upright(match, match.picks)
     ways = []
@@ -155,7 +155,7 @@ def beyond_walls(match: PreparedScan, query: PreparedScan, pose: Array) -> float
 
 
 def _beyond_walls(scan: PreparedScan, other: PreparedScan, other_T_scan: Array) -> float:
-    seen = _upright(scan, scan.picks) & (other.look_at(transform(other_T_scan, scan.sample)) != Sight.HIDDEN)
+    seen = _upright(scan, scan.picks) & (other.free_space.look_at(transform(other_T_scan, scan.sample)) != Sight.HIDDEN)
     points, normals = scan.sample[seen], scan.normals[scan.picks][seen]
     if len(points) < const.FEWEST_POINTS:
         return np.nan
@@ -186,36 +186,33 @@ def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array, standin
     """
     picks = other.picks
     rows = np.flatnonzero(_upright(other, picks)) if standing else np.arange(0, len(picks), const.SCOUT_EVERY)
-    points = at_poses(poses, other.sample[rows])
-    reach = np.tile(counterpart_reach(other.spacing[rows], common_blur(scan, other)), len(poses))
-    away = np.sqrt(
-        scan.nearest(points)[1] if patterned(scan, other) else _nearest_of_others(scan, other, poses, points, rows)
-    )
-    misfit = np.minimum(away / reach, const.RIVAL_MISFIT)
-    seen = ((scan.look_at(points) != Sight.HIDDEN) & np.isfinite(away)).reshape(len(poses), -1)
+    reach = counterpart_reach(other.spacing[rows], common_blur(scan, other))
+    misfit: Array = scan.free_space.point_misfits(scan.tree, other.sample[rows], reach, poses, const.RIVAL_MISFIT)
+    if not patterned(scan, other):
+        away = _distances_of_others(scan, other, poses, rows)
+        misfit = np.where(np.isfinite(misfit) & np.isfinite(away), np.minimum(away / reach, const.RIVAL_MISFIT), np.nan)
+    seen = np.isfinite(misfit)
     otherwise = np.nan if standing else const.RIVAL_MISFIT
-    return mean_misfits(misfit.reshape(seen.shape), seen, const.FEWEST_POINTS, otherwise)
+    return mean_misfits(np.where(seen, misfit, 0.0), seen, const.FEWEST_POINTS, otherwise)
 
 
-def _nearest_of_others(
-    submap: PreparedScan, other: PreparedScan, poses: Array, points: Array, rows: NDArray[np.intp]
-) -> Array:
-    """(K * N,) m^2: squared distance of each point to the nearest one that was seen from another place, or infinite.
+def _distances_of_others(submap: PreparedScan, other: PreparedScan, poses: Array, rows: NDArray[np.intp]) -> Array:
+    """(K, N) m: distance of each point to the nearest one that was seen from another place, or infinite.
 
     Args:
         submap: has the nearest points.
         other: has the points.
         poses: (K, 4, 4) `submap_T_other`.
-        points: (K * N, 3) m, some of its sample at the poses.
-        rows: (N,) of the sample.
+        rows: (N,) of the other's sample.
     """
     places = at_poses(poses, other.lidars).reshape(len(poses), -1, 1, 3)
     apart = np.linalg.norm(places - submap.lidars, axis=3) > const.SAME_PLACE_OF_SCANS_M
-    index, squared = submap.tree.batch_knn_search(points, const.NEIGHBOURS, 1)
-    theirs = submap.owner[np.asarray(index, np.intp)].reshape(len(poses), -1, const.NEIGHBOURS)
+    index, squared = submap.tree.neighbours(at_poses(poses, other.sample[rows]), const.NEIGHBOURS)
+    theirs = submap.owner[index].reshape(len(poses), -1, const.NEIGHBOURS)
     ours = other.owner[other.picks[rows]]
     known = apart[np.arange(len(poses))[:, None, None], ours[None, :, None], theirs]
-    return np.where(known.reshape(-1, const.NEIGHBOURS), np.asarray(squared), np.inf).min(axis=1)
+    nearest: Array = np.where(known, squared.reshape(known.shape), np.inf).min(axis=2)
+    return np.sqrt(nearest)
 
 
 def mean_misfits(misfits: Array, known: Mask, fewest: float, otherwise: float) -> Array:
