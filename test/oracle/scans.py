@@ -1,4 +1,4 @@
-"""What the kernels compute, by NumPy, SciPy and small_gicp: slow, and written from the definitions."""
+"""Results of the kernels by NumPy, SciPy and small_gicp: slow, and written from the definitions."""
 
 from __future__ import annotations
 

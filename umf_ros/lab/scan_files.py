@@ -381,7 +381,7 @@ def read_image(path: Path) -> Image:
 
 
 def read_picture(path: Path, flags: int = cv2.IMREAD_GRAYSCALE) -> NDArray[Any]:
-    """What OpenCV reads of a file that is no camera's, (H, W) or (H, W, C).
+    """Picture of a file that is no camera's, as OpenCV reads it, (H, W) or (H, W, C).
 
     Raises:
         SensorFileError: it cannot be read, is no picture, or is too large.

@@ -202,7 +202,7 @@ class PreparedScan:
 
     @cached_property
     def free_space(self) -> kernels.FreeSpace:
-        """What the rays of this scan say of points of its body frame."""
+        """Free space of this scan, in its body frame."""
         poses = self._lidars_T_body
         return free_space([transform(pose, self.points[self.owner == i]) for i, pose in enumerate(poses)], poses)
 
