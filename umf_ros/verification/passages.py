@@ -34,6 +34,8 @@ class PassagePosition(NamedTuple):
         misfits, known: (N,) of the points of both scans, as in `Misfits`.
         metre: (N,) of each point along the passage.
         lead: how much worse the scans fit elsewhere along the passage, as a share of what a closure needs.
+        undisputed: whether `pose` is the one that was asked about, which other measurements found, and the scans fit
+            worse everywhere else.
     """
 
     pose: Array
@@ -43,6 +45,12 @@ class PassagePosition(NamedTuple):
     known: NDArray[np.bool_]
     metre: NDArray[np.int64]
     lead: float = np.inf
+    undisputed: bool = False
+
+    @property
+    def decides(self) -> bool:
+        """Whether it is the position of a closure."""
+        return self.undisputed or self.lead >= 1.0
 
     def lead_over(self, rivals: list[PassagePosition]) -> float:
         """The lead, also over positions of the same scans turned round."""
@@ -58,12 +66,16 @@ class PassagePosition(NamedTuple):
         moved or a person explains it. Near the identity more is asked, for what is left of the pattern's influence is
         there.
         """
-        worse = np.where(known & self.known, misfits - self.misfits, 0.0)
-        sums = np.stack([np.bincount(self.metre, row) for row in worse])
-        sigmas = sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9)
         needed = const.PATTERN_SIGMAS if near_identity(self.pose) else const.PASSAGE_SIGMAS
+        sigmas = self.sigmas(misfits, known)
         found: Array = np.minimum((means - self.mean) / const.PASSAGE_LEAD, sigmas / needed)
         return found
+
+    def sigmas(self, misfits: Array, known: NDArray[np.bool_]) -> Array:
+        """(K,) by how many standard deviations rivals fit worse, as metres along the passage vary."""
+        worse = np.where(known & self.known, misfits - self.misfits, 0.0)
+        sums = np.stack([np.bincount(self.metre, row) for row in worse])
+        return np.asarray(sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9))
 
     def compared(self, pose: Array) -> bool:
         """Whether a pose, up to its position along the passage, is this one: it was compared with it."""
@@ -75,7 +87,8 @@ class PassagePosition(NamedTuple):
 def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> PassagePosition | None:
     """Return the pose along a passage at which the surfaces of two scans fit best; None elsewhere, and for submaps.
 
-    Poses as far along as scans overlap are compared by some of the points, and the best are aligned.
+    Poses as far along as scans overlap are compared by some of the points, and the best are aligned. A pose beside the
+    best one stays as it is.
 
     Args:
         match: the matched scan.
@@ -100,15 +113,26 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     poses = np.stack([pose, *aligned, *best])  # alignments may all end at one pose
     misfits, known = _misfits(match, query, poses)
     means = _means(misfits, known)
-    first = int(np.argmin(means[: 1 + len(aligned)]))
-    points = [transform(poses[first], half) for half in _halves(query)] + _halves(match)
-    metre = np.floor(np.concatenate(points) @ way).astype(np.int64)
-    found = PassagePosition(poses[first], way, means[first], misfits[first], known[first], metre - metre.min())
-    elsewhere = np.abs((poses[:, :3, 3] - poses[first, :3, 3]) @ way) > const.PASSAGE_BESIDE_M
-    elsewhere &= means < 0.0  # of the others too few points are known
+
+    def position(row: int) -> tuple[PassagePosition, NDArray[np.bool_]]:
+        """Return one of the poses, and which of them are rivals."""
+        points = [transform(poses[row], half) for half in _halves(query)] + _halves(match)
+        metre = np.floor(np.concatenate(points) @ way).astype(np.int64)
+        found = PassagePosition(poses[row], way, means[row], misfits[row], known[row], metre - metre.min())
+        beside = np.abs((poses[:, :3, 3] - poses[row, :3, 3]) @ way) <= const.PASSAGE_BESIDE_M
+        return found, ~beside & (means < 0.0)  # of the others too few points are known
+
+    found, elsewhere = position(0)
+    needed = const.UNDISPUTED_SIGMAS if known[0].mean() > const.PASSAGE_KNOWN else 0.0
+    if elsewhere.any() and found.sigmas(misfits[elsewhere], known[elsewhere]).min() > needed:
+        return found._replace(undisputed=True)
+    found, elsewhere = position(int(np.argmin(means[: 1 + len(aligned)])))
     if not elsewhere.any():
         return found._replace(lead=0.0)
-    return found._replace(lead=float(found.leads(means[elsewhere], misfits[elsewhere], known[elsewhere]).min()))
+    lead = float(found.leads(means[elsewhere], misfits[elsewhere], known[elsewhere]).min())
+    # about this place the alignment knows better where it is than planes do
+    stays = abs((pose[:3, 3] - found.pose[:3, 3]) @ way) <= const.PASSAGE_BESIDE_M
+    return found._replace(pose=pose if stays else found.pose, lead=lead)
 
 
 def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Misfits:

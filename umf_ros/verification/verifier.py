@@ -149,7 +149,7 @@ class Verifier:
 
         The others are only aligned where one of these is promising: the right pose may be among them. The slow tests
         are left out where they cannot change the decision; of the hypotheses along one passage, the first stands for
-        all.
+        all, or one that is undisputed.
         """
         aligned = self._aligned(hypotheses[: const.MAX_REFINED], [])
         promising = [one.candidate for one in aligned if self._promises(one, least)]
@@ -158,11 +158,22 @@ class Verifier:
         judged: list[Hypothesis] = []
         passages: list[tuple[Hypothesis, PassagePosition]] = []
         for one in aligned:
-            if any(one.candidate is other.candidate and found.compared(one.pose) for other, found in passages):
+            along = [
+                (other, found)
+                for other, found in passages
+                if one.candidate is other.candidate and found.compared(one.pose)
+            ]
+            if any(found.decides for _, found in along):
                 continue
-            judged.append(one)
             one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
-            if self._promises(one, least) and (found := self._look_elsewhere(one)):
+            found = self._look_elsewhere(one) if self._promises(one, least) else None
+            if along and not (found and found.undisputed):
+                continue
+            for other in along:
+                passages.remove(other)
+                judged.remove(other[0])
+            judged.append(one)
+            if found:
                 passages.append((one, found))
             one.probability = self._probability(one)
             if one.scans and self._objection(one) is None:
@@ -182,13 +193,13 @@ class Verifier:
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
     def _look_elsewhere(self, hypothesis: Hypothesis) -> PassagePosition | None:
-        """Compare with other poses; of scans in a passage, move to the best position along it, and return it."""
+        """Compare with other poses; of scans in a passage, move to the best position along it, and return that."""
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
         found = locate_along(theirs, ours, hypothesis.pose)
-        if found is None:
+        if found is None or found.undisputed:
             hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
-            return None
+            return found
         hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
         self._measure(hypothesis)
         hypothesis.measurements["lead"] = found.lead  # the probability is that of a pose in a passage
@@ -294,5 +305,7 @@ def _most_probable(judged: list[Hypothesis]) -> dict[int, Hypothesis]:
 def _compare_headings(passages: list[tuple[Hypothesis, PassagePosition]]) -> None:
     """Of hypotheses in a passage, count the other heading of the same candidate as a rival."""
     for one, found in passages:
+        if found.undisputed:
+            continue
         turned = [its for other, its in passages if other is not one and other.candidate is one.candidate]
         one.measurements["lead"] = found.lead_over(turned)
