@@ -21,7 +21,7 @@ from umf_ros.verification import Hypothesis, RejectReason, Verifier, verifier
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import known_only
-from umf_ros.verification.passages import PassagePosition, _peaks, locate_along
+from umf_ros.verification.passages import PassagePosition, Rivals, _peaks, locate_along, undisputed
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import align_scans
 from umf_ros.verification.scan_consistency import ambiguity, compare_scans
@@ -259,7 +259,9 @@ def position(*misfits: float, lead: float = 2.0) -> PassagePosition:
     points, metre = np.repeat(misfits, 10), np.repeat(np.arange(len(misfits)), 10)
     known = np.ones(len(points), bool)
     away = shift(5.0)
-    return PassagePosition(away, np.array([1.0, 0.0, 0.0]), math.log(points.mean()), points, known, metre, lead)
+    mean = math.log(points.mean())
+    itself = Rivals(away[None], np.array([mean]), points[None], known[None])
+    return PassagePosition(away, np.array([1.0, 0.0, 0.0]), mean, points, known, metre, itself, lead)
 
 
 def test_the_other_heading_is_a_rival_too() -> None:
@@ -277,7 +279,7 @@ def test_a_single_thing_is_no_evidence_of_a_heading_either() -> None:
 def test_a_pose_in_a_passage_is_probable_without_rivals_by_points() -> None:
     verdict = verdict_of(corridor(0.0, 1, UNEVEN, 0.3), corridor(1.5, 2, UNEVEN, 0.3), shift(1.5))
     assert verdict.probability is not None and verdict.probability > 0.9
-    assert "rival_far" not in verdict.measurements and verdict.measurements["lead"] > 0.9
+    assert verdict.measurements["lead"] > 0.9
 
 
 def test_a_passage_that_fits_as_well_turned_round_gives_no_closure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -306,4 +308,22 @@ def test_in_a_passage_the_measurements_are_those_of_the_pose_that_was_taken() ->
     expected = known_only(compare_scans(*verdict.scans, verdict.pose))
     names = compare_scans(match, query, np.eye(4)).keys()
     assert {name: verdict.measurements[name] for name in names & verdict.measurements.keys()} == expected
-    assert "runner_up" not in verdict.measurements and "rival_far" not in verdict.measurements
+
+
+@pytest.mark.parametrize(("at_m", "expected"), [(1.5, True), (0.0, False), (-1.5, False)])
+def test_a_pose_stands_where_all_others_along_a_passage_fit_worse(at_m: float, expected: bool) -> None:
+    match, query = corridor(0.0, 1, UNEVEN, 0.3), corridor(1.5, 2, UNEVEN, 0.3)
+    found = locate_along(match, query, shift(3.0))
+    assert found is not None and not found.undisputed
+    assert undisputed(found, match, query, shift(at_m)) == expected
+    empty = PAIRS["corridor"]
+    nowhere = locate_along(*empty, np.eye(4))
+    assert nowhere is not None
+    assert not any(undisputed(nowhere, *empty, shift(metres)) for metres in (0.0, 2.0, 5.0))
+
+
+def test_a_pose_beside_the_best_position_stays_as_it_is() -> None:
+    match, query = corridor(0.0, 1, UNEVEN, 0.3), corridor(1.5, 2, UNEVEN, 0.3)
+    for begun_m, end_m in ((1.7, 1.7), (3.0, 1.5)):
+        found = locate_along(match, query, shift(begun_m))
+        assert found is not None and found.pose[0, 3] == pytest.approx(end_m, abs=0.1)

@@ -126,9 +126,9 @@ PASSAGE_SHIFTS_M = np.arange(-15.0, 15.1, 0.25)  # geometry: as far as scans ove
 PASSAGE_BESIDE_M = 0.625  # measured: nearer poses are no rivals: a cupboard half its width off fits in part
 PASSAGE_RIVALS, PASSAGE_APART = 16, 4  # by hand: of these poses, that are aligned, and shifts between two of them
 PASSAGE_SAME_M = 0.1  # measured: alignments that end so near each other count once; .25 m moves verdicts
-# standard deviations by which all rivals fit worse than a pose that other measurements found, where more than this share
-# of the points is known; elsewhere, as outdoors, none may fit better. measured: of 43 right poses of a real corridor 29
-# have more, of 152 wrong ones of simulated passages none has .6, and where less is known none fits best
+# standard deviations by which all rivals fit worse than a pose that other measurements found, where more than this
+# share of points is known; elsewhere, as outdoors, none may fit better. measured: of 43 right poses of a real corridor
+# 29 have more, of 152 wrong ones of simulated passages none has .6, and where less is known none fits best
 PASSAGE_KNOWN, UNDISPUTED_SIGMAS = 0.2, 1.0
 # measured on validation passages: log of the ratio of misfits, and standard deviations, the larger near the identity
 PASSAGE_LEAD, PASSAGE_SIGMAS, PATTERN_SIGMAS = 0.08, 1.6, 2.4

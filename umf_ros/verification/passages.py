@@ -24,6 +24,15 @@ Misfits = tuple[Array, NDArray[np.bool_]]
 """(K, N) of points at poses, from 0 on a surface to 1 off all or in space seen empty; and whether they are known."""
 
 
+class Rivals(NamedTuple):
+    """Poses (K, 4, 4) `match_T_query` along a passage with their misfits (K, N), and (K,) logarithms of the means."""
+
+    poses: Array
+    means: Array
+    misfits: Array
+    known: NDArray[np.bool_]
+
+
 class PassagePosition(NamedTuple):
     """The pose `match_T_query` at which two scans in a passage fit best along it, at one heading.
 
@@ -33,9 +42,9 @@ class PassagePosition(NamedTuple):
         mean: logarithm of the mean misfit.
         misfits, known: (N,) of the points of both scans, as in `Misfits`.
         metre: (N,) of each point along the passage.
+        rivals: the poses that were compared.
         lead: how much worse the scans fit elsewhere along the passage, as a share of what a closure needs.
-        undisputed: whether `pose` is the one that was asked about, which other measurements found, and the scans fit
-            worse everywhere else.
+        undisputed: whether `pose` is one that other measurements found, and the scans fit worse everywhere else.
     """
 
     pose: Array
@@ -44,8 +53,15 @@ class PassagePosition(NamedTuple):
     misfits: Array
     known: NDArray[np.bool_]
     metre: NDArray[np.int64]
+    rivals: Rivals
     lead: float = np.inf
     undisputed: bool = False
+
+    @property
+    def elsewhere(self) -> NDArray[np.bool_]:
+        """(K,) which of the rivals lie elsewhere along the passage; of some too few points are known."""
+        beside = np.abs((self.rivals.poses[:, :3, 3] - self.pose[:3, 3]) @ self.way) <= const.PASSAGE_BESIDE_M
+        return np.asarray(~beside & (self.rivals.means < 0.0))
 
     @property
     def decides(self) -> bool:
@@ -113,26 +129,40 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     poses = np.stack([pose, *aligned, *best])  # alignments may all end at one pose
     misfits, known = _misfits(match, query, poses)
     means = _means(misfits, known)
-
-    def position(row: int) -> tuple[PassagePosition, NDArray[np.bool_]]:
-        """Return one of the poses, and which of them are rivals."""
-        points = [transform(poses[row], half) for half in _halves(query)] + _halves(match)
-        metre = np.floor(np.concatenate(points) @ way).astype(np.int64)
-        found = PassagePosition(poses[row], way, means[row], misfits[row], known[row], metre - metre.min())
-        beside = np.abs((poses[:, :3, 3] - poses[row, :3, 3]) @ way) <= const.PASSAGE_BESIDE_M
-        return found, ~beside & (means < 0.0)  # of the others too few points are known
-
-    found, elsewhere = position(0)
-    needed = const.UNDISPUTED_SIGMAS if known[0].mean() > const.PASSAGE_KNOWN else 0.0
-    if elsewhere.any() and found.sigmas(misfits[elsewhere], known[elsewhere]).min() > needed:
-        return found._replace(undisputed=True)
-    found, elsewhere = position(int(np.argmin(means[: 1 + len(aligned)])))
+    rivals = Rivals(poses, means, misfits, known)
+    first = int(np.argmin(means[: 1 + len(aligned)]))
+    found = _position(match, query, way, rivals, first)
+    elsewhere = found.elsewhere
     if not elsewhere.any():
         return found._replace(lead=0.0)
     lead = float(found.leads(means[elsewhere], misfits[elsewhere], known[elsewhere]).min())
     # about this place the alignment knows better where it is than planes do
     stays = abs((pose[:3, 3] - found.pose[:3, 3]) @ way) <= const.PASSAGE_BESIDE_M
     return found._replace(pose=pose if stays else found.pose, lead=lead)
+
+
+def undisputed(found: PassagePosition, match: PreparedScan, query: PreparedScan, pose: Array) -> bool:
+    """Whether scans fit worse at all positions along a passage that were compared than at a pose beside them.
+
+    Such a pose (4, 4) `match_T_query`, which other measurements found, need not lead by as much as one that this
+    comparison found.
+    """
+    rivals = found.rivals
+    misfits, known = _misfits(match, query, pose[None])
+    here = _position(match, query, found.way, Rivals(pose[None], np.zeros(1), misfits, known), 0)
+    elsewhere = here._replace(rivals=rivals).elsewhere
+    needed = const.UNDISPUTED_SIGMAS if known.mean() > const.PASSAGE_KNOWN else 0.0
+    return bool(elsewhere.any() and here.sigmas(rivals.misfits[elsewhere], rivals.known[elsewhere]).min() > needed)
+
+
+def _position(match: PreparedScan, query: PreparedScan, way: Array, poses: Rivals, row: int) -> PassagePosition:
+    """Return one of some poses along a passage."""
+    pose = poses.poses[row]
+    points = [transform(pose, half) for half in _halves(query)] + _halves(match)
+    metre = np.floor(np.concatenate(points) @ way).astype(np.int64)
+    return PassagePosition(
+        pose, way, float(poses.means[row]), poses.misfits[row], poses.known[row], metre - metre.min(), poses
+    )
 
 
 def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Misfits:

@@ -16,7 +16,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
-from umf_ros.verification.passages import PassagePosition, locate_along
+from umf_ros.verification.passages import PassagePosition, locate_along, undisputed
 from umf_ros.verification.pose_search import (
     RotatedMaps,
     TemporalMemory,
@@ -158,20 +158,14 @@ class Verifier:
         judged: list[Hypothesis] = []
         passages: list[tuple[Hypothesis, PassagePosition]] = []
         for one in aligned:
-            along = [
-                (other, found)
-                for other, found in passages
-                if one.candidate is other.candidate and found.compared(one.pose)
-            ]
-            if any(found.decides for _, found in along):
+            promises, earlier = self._promises(one, least), _along(one, passages)
+            if earlier and not (promises and self._replaces(one, earlier[1])):
                 continue
             one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
-            found = self._look_elsewhere(one) if self._promises(one, least) else None
-            if along and not (found and found.undisputed):
-                continue
-            for other in along:
-                passages.remove(other)
-                judged.remove(other[0])
+            found = self._look_elsewhere(one, earlier[1] if earlier else None) if promises else None
+            if earlier:
+                passages.remove(earlier)
+                judged.remove(earlier[0])
             judged.append(one)
             if found:
                 passages.append((one, found))
@@ -192,11 +186,19 @@ class Verifier:
         of_pose = measure(hypothesis) | {"support": self._memory.support(query, match, hypothesis.pose)}
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
-    def _look_elsewhere(self, hypothesis: Hypothesis) -> PassagePosition | None:
+    @staticmethod
+    def _replaces(hypothesis: Hypothesis, found: PassagePosition) -> bool:
+        """Whether a hypothesis stands for its passage, where another before it found no position along it."""
+        theirs, ours = hypothesis.scans
+        return not found.decides and undisputed(found, theirs, ours, hypothesis.pose)
+
+    def _look_elsewhere(self, hypothesis: Hypothesis, compared: PassagePosition | None) -> PassagePosition | None:
         """Compare with other poses; of scans in a passage, move to the best position along it, and return that."""
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
-        found = locate_along(theirs, ours, hypothesis.pose)
+        found = compared or locate_along(theirs, ours, hypothesis.pose)
+        if found is not None and undisputed(found, theirs, ours, hypothesis.pose):
+            found = found._replace(pose=hypothesis.pose, undisputed=True)
         if found is None or found.undisputed:
             hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
             return found
@@ -300,6 +302,14 @@ class Verifier:
 def _most_probable(judged: list[Hypothesis]) -> dict[int, Hypothesis]:
     """Of hypotheses about each candidate, by its index, the one that decides."""
     return {one.candidate.index: one for one in sorted(judged, key=lambda one: one.probability or 0.0)}
+
+
+def _along(
+    hypothesis: Hypothesis, passages: list[tuple[Hypothesis, PassagePosition]]
+) -> tuple[Hypothesis, PassagePosition] | None:
+    """Return the hypothesis about the same candidate whose positions along a passage this one's pose is among."""
+    same = (one for one in passages if one[0].candidate is hypothesis.candidate)
+    return next((one for one in same if one[1].compared(hypothesis.pose)), None)
 
 
 def _compare_headings(passages: list[tuple[Hypothesis, PassagePosition]]) -> None:
