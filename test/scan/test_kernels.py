@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -182,7 +185,7 @@ def test_nan_and_infinite_points_end_nothing(scan: Array) -> None:
     assert len(space.look_at(strange)) == 3 and (tree.nearest(strange)[0] < len(scan)).all()
     assert len(kernels.KdTree(np.concatenate([scan, strange])).normals(10)) == len(scan) + 3
     kernels.RangeImage(strange, *RULES)
-    kernels.cell_means(strange.astype(np.float32), strange.astype(np.float32), CELL_M, RANGE_M)
+    kernels.cell_means(np.float32([[np.nan, 0, 0], [np.inf, 0, 0]]), np.ones((2, 1), np.float32), CELL_M, RANGE_M)
 
 
 def test_other_threads_run_meanwhile(scan: Array) -> None:
@@ -206,3 +209,14 @@ def test_other_threads_run_meanwhile(scan: Array) -> None:
         done.set()
         other.join()
     assert sum(start < one < end for one in ticks) > 3
+
+
+def test_a_package_that_was_not_built_says_so(tmp_path: Path) -> None:
+    package = Path(kernels.__file__).parents[1]
+    shutil.copytree(
+        package, tmp_path / "umf_ros", ignore=shutil.ignore_patterns("*.so", "lab", "baselines", "__pycache__")
+    )
+    command = [sys.executable, "-m", "umf_ros.cli", "replay", str(tmp_path)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert "umf_ros/scan/_kernels, is missing or of another Python: run `make install`" in done.stderr
