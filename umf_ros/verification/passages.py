@@ -131,7 +131,8 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     means = _means(misfits, known)
     rivals = Rivals(poses, means, misfits, known)
     first = int(np.argmin(means[: 1 + len(aligned)]))
-    found = _position(match, query, way, rivals, first)
+    metre = _metres(match, query, way, poses[first])
+    found = PassagePosition(poses[first], way, means[first], misfits[first], known[first], metre, rivals)
     elsewhere = found.elsewhere
     if not elsewhere.any():
         return found._replace(lead=0.0)
@@ -149,20 +150,18 @@ def undisputed(found: PassagePosition, match: PreparedScan, query: PreparedScan,
     """
     rivals = found.rivals
     misfits, known = _misfits(match, query, pose[None])
-    here = _position(match, query, found.way, Rivals(pose[None], np.zeros(1), misfits, known), 0)
-    elsewhere = here._replace(rivals=rivals).elsewhere
+    metre = _metres(match, query, found.way, pose)
+    here = found._replace(pose=pose, misfits=misfits[0], known=known[0], metre=metre)
+    elsewhere = here.elsewhere
     needed = const.UNDISPUTED_SIGMAS if known.mean() > const.PASSAGE_KNOWN else 0.0
     return bool(elsewhere.any() and here.sigmas(rivals.misfits[elsewhere], rivals.known[elsewhere]).min() > needed)
 
 
-def _position(match: PreparedScan, query: PreparedScan, way: Array, poses: Rivals, row: int) -> PassagePosition:
-    """Return one of some poses along a passage."""
-    pose = poses.poses[row]
+def _metres(match: PreparedScan, query: PreparedScan, way: Array, pose: Array) -> NDArray[np.int64]:
+    """(N,) of each point of both scans along a passage, from 0 on, at a pose (4, 4) `match_T_query`."""
     points = [transform(pose, half) for half in _halves(query)] + _halves(match)
     metre = np.floor(np.concatenate(points) @ way).astype(np.int64)
-    return PassagePosition(
-        pose, way, float(poses.means[row]), poses.misfits[row], poses.known[row], metre - metre.min(), poses
-    )
+    return metre - metre.min()
 
 
 def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Misfits:

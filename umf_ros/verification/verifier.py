@@ -193,11 +193,14 @@ class Verifier:
         return not found.decides and undisputed(found, theirs, ours, hypothesis.pose)
 
     def _look_elsewhere(self, hypothesis: Hypothesis, compared: PassagePosition | None) -> PassagePosition | None:
-        """Compare with other poses; of scans in a passage, move to the best position along it, and return that."""
+        """Compare with other poses; of scans in a passage, move to the best position along it, and return that.
+
+        `compared` is of an earlier hypothesis along the passage, which this one replaces.
+        """
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
         found = compared or locate_along(theirs, ours, hypothesis.pose)
-        if found is not None and undisputed(found, theirs, ours, hypothesis.pose):
+        if found is not None and (compared or undisputed(found, theirs, ours, hypothesis.pose)):
             found = found._replace(pose=hypothesis.pose, undisputed=True)
         if found is None or found.undisputed:
             hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)

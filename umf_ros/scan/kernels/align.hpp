@@ -100,8 +100,6 @@ inline Pose moved_by(const Pose& pose, const double* step) {
 struct Oriented {
   const double *points, *normals;  // (N, 3) each
   int64_t count;
-
-  static Vec3 row(const double* rows, int64_t i) { return {rows[3 * i], rows[3 * i + 1], rows[3 * i + 2]}; }
 };
 
 // target_T_source after at most `steps` steps; counterparts are nearer than `reach`. It ends where a step is below
@@ -116,28 +114,26 @@ inline Pose align(const KdTree& tree, const double* normals, const Oriented& sou
   std::vector<Pair> pairs;
   pairs.reserve(source.count);
   const auto residual = [&](const Pose& at, const Pair& pair) {
-    const float* p = tree.point(pair.target);
-    return minus({p[0], p[1], p[2]}, at * Oriented::row(source.points, pair.source));
+    return minus(tree[pair.target], at * row(source.points, pair.source));
   };
   double damping = 1e-3;
   for (int step = 0; step < steps; ++step) {
     NormalEquations sums;
     pairs.clear();
     for (int64_t i = 0; i < source.count; ++i) {
-      const Vec3 s = Oriented::row(source.points, i), moved = pose * s;
+      const Vec3 s = row(source.points, i), moved = pose * s;
       float squared = static_cast<float>(reach * reach);
       int32_t known = last[i];
       if (known >= 0) {  // the counterpart of the last step bounds the search
-        const float* p = tree.point(known);
-        const float x = p[0] - float(moved[0]), y = p[1] - float(moved[1]), z = p[2] - float(moved[2]);
-        const float bound = (x * x + y * y + z * z) * 1.000001f;
+        const Vec3 away = minus(tree[known], moved);
+        const float bound = float(dot(away, away)) * 1.000001f;
         if (bound < squared) squared = bound; else known = -1;
       }
       last[i] = tree.nearest(moved, squared, known);
       if (last[i] < 0) continue;
       Symmetric3 both{2, 0, 0, 2, 0, 2};
-      subtract_outer(both, pose.turn_back(Oriented::row(normals, last[i])));
-      subtract_outer(both, Oriented::row(source.normals, i));
+      subtract_outer(both, pose.turn_back(row(normals, last[i])));
+      subtract_outer(both, row(source.normals, i));
       pairs.push_back({static_cast<int32_t>(i), last[i], both.inverse()});
       sums.add(s, pairs.back().weights, pose.turn_back(residual(pose, pairs.back())));
     }

@@ -25,7 +25,7 @@ class KdTree {
   }
 
   int64_t size() const { return static_cast<int64_t>(points_.size() / 3); }
-  const float* point(int64_t index) const { return &points_[3 * index]; }
+  Vec3 operator[](int64_t index) const { return {point(index)[0], point(index)[1], point(index)[2]}; }
 
   // Index of the nearest point whose squared distance is below `squared`, which it sets; else `otherwise`.
   int32_t nearest(const Vec3& query, float& squared, int32_t otherwise = -1) const {
@@ -65,6 +65,8 @@ class KdTree {
   }
 
  private:
+  const float* point(int64_t index) const { return &points_[3 * index]; }
+
   struct Block {
     float x[kBlock], y[kBlock], z[kBlock];
     int32_t index[kBlock];

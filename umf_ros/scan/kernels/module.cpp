@@ -38,8 +38,6 @@ void require(bool met, const char* text) {
   if (!met) throw std::invalid_argument(text);
 }
 
-Vec3 row(const double* rows, int64_t i) { return {rows[3 * i], rows[3 * i + 1], rows[3 * i + 2]}; }
-
 nb::tuple nearest(const KdTree& tree, const Points& queries) {
   const size_t count = queries.shape(0);
   require(tree.size() > 0, "the tree has no points");
@@ -96,8 +94,7 @@ nb::tuple planes(const KdTree& tree, int wanted) {
   {
     nb::gil_scoped_release free;
     for (size_t i = 0; i < count; ++i) {
-      const float* p = tree.point(i);
-      const Neighbourhood around(tree, {p[0], p[1], p[2]}, wanted);
+      const Neighbourhood around(tree, tree[i], wanted);
       reach.data[i] = around.reach;
       for (int k = 0; k < 3; ++k) {
         centres.data[3 * i + k] = around.mean[k];

@@ -20,8 +20,7 @@ struct Neighbourhood {
     Vec3 sum{};
     Symmetric3 squares;
     for (int i = 0; i < count; ++i) {
-      const float* p = tree.point(index[i]);
-      const Vec3 d{p[0] - at[0], p[1] - at[1], p[2] - at[2]};
+      const Vec3 d = minus(tree[index[i]], at);
       for (int k = 0; k < 3; ++k) sum[k] += d[k];
       squares.xx += d[0] * d[0];
       squares.xy += d[0] * d[1];
@@ -42,8 +41,7 @@ struct Neighbourhood {
 // Unit normals (N, 3) of the points of a tree towards the origin; zero where there are fewer than five neighbours.
 inline void normals_of(const KdTree& tree, int wanted, double* normals) {
   for (int64_t i = 0; i < tree.size(); ++i) {
-    const float* p = tree.point(i);
-    const Vec3 at{p[0], p[1], p[2]};
+    const Vec3 at = tree[i];
     const Neighbourhood around(tree, at, wanted);
     const double sign = around.count < 5 ? 0.0 : dot(around.normal, at) > 0 ? -1.0 : 1.0;
     for (int k = 0; k < 3; ++k) normals[3 * i + k] = sign * around.normal[k];
