@@ -15,7 +15,7 @@ from umf_ros.verification.visibility import Sight
 
 GROUND = landscape(20)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
-READY = ("view", "terrain", "free_space", "spacing", "oriented_scouts", "oriented_sample", "normals", "up")
+READY = ("view", "terrain", "free_space", "spacing", "oriented_scouts", "oriented_sample", "sample_normals", "up")
 
 
 def test_a_scan_is_ready_once_and_forgotten_when_stamps_start_over() -> None:

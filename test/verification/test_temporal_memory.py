@@ -88,17 +88,19 @@ def test_without_odometry_or_across_sessions_there_is_no_support(change: dict[st
     memory.remember(pair(0.0)[0], [(*pair(0.0)[1:], True)])
     query, match, pose = pair(1.0)
     assert memory.support(replace(query, **change), match, pose) == 0
-    assert memory.expected(replace(query, **change), offered(match)) == []
+    assert memory.expected(replace(query, **change), offered(match)) is None
 
 
 def test_expected_place_needs_an_accepted_closure() -> None:
     memory = TemporalMemory()
     query, match, pose = pair(0.0)
     memory.remember(query, [(match, pose, False)])
-    later, place, _ = pair(1.0)
-    assert memory.expected(later, offered(place)) == []
+    later, place, truth_there = pair(1.0)
+    assert memory.expected(later, offered(place)) is None
     memory.remember(query, [(match, pose, True)])
-    assert memory.expected(later, offered(place)) == offered(place)
+    found = memory.expected(later, offered(place))
+    assert found is not None and found[0] == offered(place)[0]
+    np.testing.assert_allclose(found[1], truth_there, atol=1e-6)
 
 
 def test_of_the_expected_places_the_nearest_is_taken_and_none_that_is_far() -> None:
@@ -107,6 +109,7 @@ def test_of_the_expected_places_the_nearest_is_taken_and_none_that_is_far() -> N
     query = pair(1.0)[0]  # expected at (1, 1)
     places = [keyframe(x, 0.0, 0.0, 10 + x) for x in (-1.0, 2.5, 0.5, 6.0)]
     candidates = offered(*places)
-    assert memory.expected(query, candidates) == [candidates[2]]
-    assert memory.expected(query, candidates[3:]) == []  # five metres off
-    assert memory.expected(query, []) == []
+    found = memory.expected(query, candidates)
+    assert found is not None and found[0] == candidates[2]
+    assert memory.expected(query, candidates[3:]) is None  # five metres off
+    assert memory.expected(query, []) is None

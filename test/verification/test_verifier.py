@@ -21,6 +21,8 @@ from umf_ros.sensors.decode import Cloud
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
 from umf_ros.verification.hypothesis import SCAN
+from umf_ros.verification.pose_search import Fit, RotatedMaps, search
+from umf_ros.verification.prepared_scan import PreparedScan
 
 GROUND, ELSEWHERE = landscape(20), landscape(99)
 LEAST = 0.7  # probability of a right pose where nothing stands up from the ground
@@ -277,19 +279,55 @@ def test_what_is_expected_and_found_needs_no_comparison_of_the_others(verifier: 
     assert RejectReason.NOT_COMPARED not in {verdict.reason for verdict in last}  # more were asked for
 
 
+def test_the_predicted_pose_is_judged_without_a_search_but_every_few_keyframes(
+    verifier: Verifier, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched: list[int] = []
+
+    def counted(match: PreparedScan, turned: RotatedMaps) -> list[Fit]:
+        searched.append(step)
+        return search(match, turned)
+
+    monkeypatch.setattr("umf_ros.verification.pose_search.search", counted)
+    poses = [(pose_at(GROUND, x, 1.2, 6.0), pose_at(GROUND, x - 1.0, 0.0, 0.0)) for x in np.arange(-14.0, -9.0, 0.5)]
+    for step, (here, there) in enumerate(poses):
+        query, match = (
+            replace(take(GROUND, pose, start_s + step), odom_T_body=pose)
+            for pose, start_s in ((here, 100.0), (there, 10.0))
+        )
+        closure = verifier.verify(query, [candidate(match)])[0].closure
+        assert closure is not None and near(closure.match_T_query, relative(there, here), 0.3, 0.1)
+    assert searched == [0, 4, 8]
+
+
+def test_what_odometry_predicts_wrongly_is_searched(verifier: Verifier) -> None:
+    (first, match), (second, later) = drive(np.eye(4))[:2]
+    assert verifier.verify(first, [candidate(match)])[0].closure is not None
+    assert second.odom_T_body is not None
+    slipped = replace(second, odom_T_body=second.odom_T_body @ make_pose(np.eye(3), [2.5, 0.0, 0.0]))
+    alone = Verifier(Verification(min_probability=LEAST)).verify(second, [candidate(later)])[0]
+    found = verifier.verify(slipped, [candidate(later)])[0]
+    assert found.closure is not None and near(found.pose, alone.pose, 0.05, 0.02)
+
+
 def test_the_others_are_compared_where_the_expected_place_is_refuted(
     verifier: Verifier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A less probable hypothesis about it that nothing refutes does not decide, and spares no comparison."""
-    pairs, refine = drive(np.eye(4)), Verifier._refine
+    pairs = drive(np.eye(4))
     verifier.verify(pairs[0][0], [candidate(pairs[0][1])])
 
-    def refine_with_a_refuted_one(self: Verifier, *given: Any) -> list[Hypothesis]:
-        judged = refine(self, *given)
-        refuted = [replace(one, measurements=one.measurements | {"lead": 0.5}, probability=1.0) for one in judged[:1]]
-        return judged + refuted
+    for name in ("_refine_predicted", "_refine"):
 
-    monkeypatch.setattr(Verifier, "_refine", refine_with_a_refuted_one)
+        def refine_with_a_refuted_one(
+            self: Verifier, *given: Any, refine: Any = getattr(Verifier, name)
+        ) -> list[Hypothesis]:
+            judged: list[Hypothesis] = refine(self, *given)
+            certain = {"probability": 1.0}
+            refuted = [replace(one, measurements=one.measurements | {"lead": 0.5}, **certain) for one in judged[:1]]
+            return judged + refuted
+
+        monkeypatch.setattr(Verifier, name, refine_with_a_refuted_one)
     verdicts = verifier.verify(pairs[1][0], [*others(2), candidate(pairs[1][1])])
     assert RejectReason.NOT_COMPARED not in {verdict.reason for verdict in verdicts}
 

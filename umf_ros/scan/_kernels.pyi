@@ -25,8 +25,8 @@ class KdTree:
         Of fewer points the last stands for the others, at an infinite distance.
         """
 
-    def normals(self, neighbours: int) -> Array:
-        """Return unit normals (N, 3) of the points towards the origin, zero where fewer than five are neighbours."""
+    def normals(self, places: Array, neighbours: int) -> Array:
+        """Return unit normals (M, 3) at places (M, 3) towards the origin, zero where fewer than five are neighbours."""
 
     def planes(self, neighbours: int) -> tuple[Array, Array, Array, Array]:
         """Return the planes through the neighbourhoods of the points.

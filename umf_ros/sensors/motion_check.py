@@ -16,7 +16,7 @@ from umf_ros.core.trajectory import Trajectory, interpolated
 
 SCAN_CELL_M, SCAN_REACH_M = 0.4, 1.0  # by hand: consecutive scans, a quarter of a metre apart
 MIN_SCAN_POINTS = 200  # by hand: below, consecutive scans are not registered
-CORNERS, CORNER_QUALITY, CORNER_SPACING, CORNER_WINDOW, CORNER_LEVELS = 300, 0.01, 8, (21, 21), 4  # by hand
+CORNERS, CORNER_QUALITY, CORNER_SPACING, CORNER_WINDOW, CORNER_LEVELS = 200, 0.01, 8, (21, 21), 4  # by hand
 MIN_CORNERS = 30  # by hand: least inliers of an essential matrix
 MIN_PAIRS = 30  # by hand: least pairs of consecutive frames for a clock
 MIN_AXES_PAIRS = 8  # by hand: least pairs of consecutive frames for axes; their evidence is measured
@@ -163,7 +163,7 @@ def _tracked(earlier: Image, later: Image, corners: Any) -> tuple[Any, Any]:
 def _view_motion(earlier: Frame, later: Frame, before: Array, after: Array) -> Step | None:
     camera = earlier.camera
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    essential, inliers = cv2.findEssentialMat(before, after, matrix, method=cv2.RANSAC, prob=0.999, threshold=1.0)
+    essential, inliers = cv2.findEssentialMat(before, after, matrix, method=cv2.USAC_DEFAULT, prob=0.999, threshold=1.0)
     if essential is None or essential.shape != (3, 3):
         return None
     count, turn, shift, _ = cv2.recoverPose(essential, before, after, matrix, mask=inliers)

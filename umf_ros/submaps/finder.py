@@ -188,13 +188,15 @@ class SubmapFinder:
 
     def _look_alike(self, query: Keyframe) -> list[int]:
         """Rows of the database whose submaps share most keypoints with that of a keyframe, or with its scan."""
-        submap = self.history.before(query) or query
         rows = np.array(self.history.keypoints.rows, np.intp)
         keys = self._database.store.keys[rows]
         # scans that both submaps hold are alike for no other reason
         first_m = query.path_length_m - 2 * const.ODOMETRY_REACH_M
         apart = (keys["session"] != query.session) | (keys["travelled_m"] < first_m)
         apart &= self._database.admissible(query, self._rules, self._sessions, rows)
+        if not apart.any() or not self.history.lengthens(query):  # else its submap is that of the keyframe before
+            return []
+        submap = self.history.before(query) or query
         return self.history.keypoints.most_alike(self._verifier.scans[submap].keypoints, apart)[: const.LOOKALIKES]
 
 

@@ -189,16 +189,19 @@ class SubmapHistory:
 
     def add(self, keyframe: Keyframe) -> bool:
         """Take up the newest keyframe if it lies far enough from the one before; returns whether it did."""
-        if not can_be_merged(keyframe):
+        if not can_be_merged(keyframe) or not self.lengthens(keyframe):
             return False
         before = self.scans_before(keyframe)
-        if before and keyframe.path_length_m - before[0].path_length_m < const.MERGE_STEP_M:
-            return False
         self.needed = bool(needed_scans(keyframe, before))
         if self.needed:
             self._drifts.setdefault(keyframe.session, DriftMeter()).add(keyframe, before)
         self._recent = [keyframe, *before]
         return True
+
+    def lengthens(self, keyframe: Keyframe) -> bool:
+        """Whether the newest keyframe lies far enough from the last one that was taken up."""
+        before = self.scans_before(keyframe)
+        return not before or keyframe.path_length_m - before[0].path_length_m >= const.MERGE_STEP_M
 
     def describe(self, session: int, complete_m: float = np.inf, most: int | None = None) -> None:
         """Find and store the keypoints of submaps of a session, of every third metre of its path.

@@ -22,6 +22,7 @@ MAX_TILT_RAD = 0.5  # by hand: a rover does not lie on its side
 MIN_PIXELS = 15  # measured: that agree on a view; of other places never more than 13 did
 DISTINCT_M, DISTINCT_RAD = 0.8, 0.1  # geometry: nearer poses end in the same basin of the alignment
 MIN_MAP_SCORE = 5.0  # by hand, in standard deviations of chance: below, two maps fit no better than noise
+SEARCHED_EVERY = 4  # by hand: keyframes whose pose is predicted from a closure, of which one is searched all the same
 MAX_REFINED = 3  # hypotheses per group of candidates that are aligned: bounds the time
 
 # views: what two images say about a pose
@@ -71,6 +72,7 @@ COARSE_REACH_M = 1.0  # geometry: two cells of the maps
 FINE_REACH_M = 0.4  # by hand: the spacing of far returns is wider than the noise
 STEPS = 8  # by hand: of every refinement, of scans, views and the direction of a passage
 STEP_M, STEP_RAD = 1e-3, np.radians(0.1)  # by hand: a refinement ends with a step as small as this
+COARSE_END = 1e-2, np.radians(0.3)  # measured: the same of one before another; a third less time, poses move by 1 mm
 MIN_SCAN_POINTS = 100  # by hand: below, there is nothing to align
 SCANS_KEPT = 16  # scans and submaps in memory; measured: 60 save 6 % of their preparations and take 230 MB more
 

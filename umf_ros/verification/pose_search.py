@@ -177,6 +177,23 @@ def lifted(match: PreparedScan, query: PreparedScan, turn: float, shift: Array) 
     return found
 
 
+def predicted_hypotheses(
+    query: Keyframe, offered: tuple[Candidate, Keyframe], scans: tuple[PreparedScan, PreparedScan], pose: Array
+) -> list[Hypothesis]:
+    """The pose `match_T_query` for a candidate that odometry carries over from a closure; none where it fits nothing.
+
+    Args:
+        query: the query keyframe.
+        offered: the candidate, and its keyframe.
+        scans: of match and query; only where they tell the pose is there a hypothesis.
+        pose: as odometry has it.
+    """
+    if not all(scan.usable for scan in scans) or views_decide(*scans):
+        return []
+    fits = coarse_align(*scans, [pose])
+    return [Hypothesis.of(query, *offered, pose=fit.pose, score=fit.score) for fit in fits]
+
+
 def find_hypotheses(
     query: Keyframe,
     candidate: Candidate,
@@ -256,17 +273,21 @@ class TemporalMemory:
 
     def expected(
         self, query: Keyframe, candidates: Sequence[tuple[Candidate, Keyframe]]
-    ) -> list[tuple[Candidate, Keyframe]]:
-        """The candidate nearest to where earlier closures and odometry put the rover, if there is one within 4 m."""
-        distances = [self._expected_distance(query, keyframe) for _, keyframe in candidates]
-        nearest = int(np.argmin(distances)) if distances else 0
-        return [candidates[nearest]] if distances and distances[nearest] < const.SAME_PLACE_M else []
+    ) -> tuple[tuple[Candidate, Keyframe], Array] | None:
+        """The candidate nearest to where earlier closures and odometry put the rover, and its `match_T_query` there.
 
-    def _expected_distance(self, query: Keyframe, match: Keyframe) -> float:
-        """Metres between a pair, as odometry carries it over from the latest accepted closure near it; or inf."""
+        None without one within 4 m.
+        """
+        poses = [(one, self._expected_pose(query, one[1])) for one in candidates]
+        away = [(float(np.linalg.norm(pose[:3, 3])), one, pose) for one, pose in poses if pose is not None]
+        nearest = min(away, key=lambda found: found[0], default=None)
+        return nearest[1:] if nearest is not None and nearest[0] < const.SAME_PLACE_M else None
+
+    def _expected_pose(self, query: Keyframe, match: Keyframe) -> Array | None:
+        """`match_T_query` as odometry carries it over from the latest accepted closure near the pair; None without."""
         accepted = (one for findings in reversed(self._findings.values()) for one in findings if one.accepted)
         carried = (_carried(finding, query, match) for finding in accepted)
-        return next((float(np.linalg.norm(pose[:3, 3])) for pose in carried if pose is not None), float("inf"))
+        return next((pose for pose in carried if pose is not None), None)
 
     def support(self, query: Keyframe, match: Keyframe, match_T_query: Array) -> float:
         """How many of the remembered earlier keyframes found a pose that odometry carries over to this one."""

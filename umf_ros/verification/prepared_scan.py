@@ -53,7 +53,7 @@ class OrientedPoints(NamedTuple):
     def of(cls, points: Array) -> OrientedPoints:
         """Give points (N, 3) their normals."""
         points = np.ascontiguousarray(points)
-        return cls(points, kernels.KdTree(points).normals(2 * const.NEIGHBOURS))
+        return cls(points, kernels.KdTree(points).normals(points, 2 * const.NEIGHBOURS))
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class PreparedScan:
     @cached_property
     def up(self) -> Array:
         """Rotation (3, 3) that sets the scan upright."""
-        return upright(self.normals[self.picks])[0]
+        return upright(self.sample_normals)[0]
 
     @property
     def upright_T_body(self) -> Array:
@@ -214,7 +214,7 @@ class PreparedScan:
     @cached_property
     def normals(self) -> Array:
         """(M, 3) unit normals, zero where the neighbourhood is too small."""
-        return self.tree.normals(2 * const.NEIGHBOURS)
+        return self.tree.normals(self.points, 2 * const.NEIGHBOURS)
 
     @cached_property
     def picks(self) -> Indices:
@@ -230,6 +230,11 @@ class PreparedScan:
     def oriented_sample(self) -> OrientedPoints:
         """The sample with normals of its own."""
         return OrientedPoints.of(self.sample)
+
+    @cached_property
+    def sample_normals(self) -> Array:
+        """(S, 3) `normals` of the sample alone."""
+        return self.tree.normals(self.sample, 2 * const.NEIGHBOURS)
 
     @property
     def scouts(self) -> Array:
@@ -251,7 +256,7 @@ class PreparedScan:
         """How far the points scatter about their neighbours' planes, m: sensor noise and roughness together."""
         neighbours, _ = self.tree.neighbours(self.sample, const.NEIGHBOURS)
         offsets = self.points[neighbours[:, 1:]] - self.sample[:, None]
-        away = np.abs(np.einsum("nki,ni->nk", offsets, self.normals[neighbours[:, 0]]))
+        away = np.abs(np.einsum("nki,ni->nk", offsets, self.sample_normals))
         return 1.4826 * float(np.median(away))
 
     @cached_property
@@ -269,7 +274,7 @@ class PreparedScan:
 
         A place is a passage where surfaces across it outweigh those along it.
         """
-        sums, _ = self._least_across(self.normals[self.picks])
+        sums, _ = self._least_across(self.sample_normals)
         if sums[0] > const.PASSAGE_RATIO * sums[1]:  # most places are none: their planes are never asked for
             return None
         flat = np.concatenate([planes.normals[planes.planar] for planes in self.surfaces])

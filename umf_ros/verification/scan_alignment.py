@@ -97,15 +97,23 @@ class Alignment:
 
 def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Alignment:
     """Generalised ICP (Segal, RSS 2009) from the pose `guess`, first far-sighted, then near-sighted."""
-    pose = run_gicp(match, query.oriented_sample, guess, const.COARSE_REACH_M)
+    pose = run_gicp(match, query.oriented_sample, guess, const.COARSE_REACH_M, const.COARSE_END)
     pose = run_gicp(match, query.oriented_sample, pose, const.FINE_REACH_M)
     return inspect(match, query, pose)
 
 
-def run_gicp(match: PreparedScan, query: OrientedPoints, guess: Array, reach_m: float) -> Array:
-    """`match_T_query` after some steps of generalised ICP from a guess; counterparts are nearer than `reach_m`."""
+def run_gicp(
+    match: PreparedScan,
+    query: OrientedPoints,
+    guess: Array,
+    reach_m: float,
+    ends: tuple[float, float] = (const.STEP_M, const.STEP_RAD),
+) -> Array:
+    """`match_T_query` after some steps of generalised ICP from a guess.
+
+    Counterparts are nearer than `reach_m`; it ends with a step below `ends`, m and rad.
+    """
     guess = np.ascontiguousarray(guess)
-    ends = const.STEP_M, const.STEP_RAD
     return kernels.align(match.tree, match.normals, *query, guess, reach_m, const.STEPS, *ends)
 
 

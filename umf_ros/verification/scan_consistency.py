@@ -37,7 +37,7 @@ def compare_scans(match: PreparedScan, query: PreparedScan, pose: Array) -> dict
     _, squared_back, of_match = query.free_space.observe(query.tree, back)
     sights, distances = (of_query, of_match), (np.sqrt(squared), np.sqrt(squared_back))
     reaches = counterpart_reach(query.spacing, blur_m), counterpart_reach(match.spacing, blur_m)
-    stands = _upright(match, index), _upright(match, match.picks)
+    stands = _upright(match, match.normals[index]), _upright(match, match.sample_normals)
     ways = []
     for sight, distance, reach, upright in zip(sights, distances, reaches, stands, strict=True):
         seen = sight != Sight.HIDDEN
@@ -60,9 +60,8 @@ def counterpart_reach(spacing: Array, blur_m: float) -> Array:
     return const.COUNTERPART_M + 2 * blur_m + const.COUNTERPART_SPACINGS * spacing
 
 
-def _upright(scan: PreparedScan, index: NDArray[np.intp]) -> Mask:
-    """(N,) whether the surfaces at these points of a scan are steeper than 45 deg; those without a normal do not."""
-    normals = scan.normals[index]
+def _upright(scan: PreparedScan, normals: Array) -> Mask:
+    """(N,) whether surfaces of a scan with these normals (N, 3) are steeper than 45 deg; those without one are not."""
     return (2 * (normals @ scan.up[2]) ** 2 < 1.0) & (np.einsum("ij,ij->i", normals, normals) > 0.5)
 
 
@@ -155,8 +154,10 @@ def beyond_walls(match: PreparedScan, query: PreparedScan, pose: Array) -> float
 
 
 def _beyond_walls(scan: PreparedScan, other: PreparedScan, other_T_scan: Array) -> float:
-    seen = _upright(scan, scan.picks) & (other.free_space.look_at(transform(other_T_scan, scan.sample)) != Sight.HIDDEN)
-    points, normals = scan.sample[seen], scan.normals[scan.picks][seen]
+    seen = _upright(scan, scan.sample_normals) & (
+        other.free_space.look_at(transform(other_T_scan, scan.sample)) != Sight.HIDDEN
+    )
+    points, normals = scan.sample[seen], scan.sample_normals[seen]
     if len(points) < const.FEWEST_POINTS:
         return np.nan
     ways, through = normals[:: const.SCOUT_EVERY], points[:: const.SCOUT_EVERY]
@@ -184,8 +185,9 @@ def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array, standin
 
     Of its scouts, and the worst misfit where few are visible; or of all that stand among its sample, and NaN.
     """
-    picks = other.picks
-    rows = np.flatnonzero(_upright(other, picks)) if standing else np.arange(0, len(picks), const.SCOUT_EVERY)
+    rows = np.arange(0, len(other.sample), const.SCOUT_EVERY)
+    if standing:
+        rows = np.flatnonzero(_upright(other, other.sample_normals))
     reach = counterpart_reach(other.spacing[rows], common_blur(scan, other))
     misfit: Array = scan.free_space.point_misfits(scan.tree, other.sample[rows], reach, poses, const.RIVAL_MISFIT)
     if not patterned(scan, other):

@@ -22,6 +22,7 @@ from umf_ros.verification.pose_search import (
     TemporalMemory,
     consistent_pixels,
     find_hypotheses,
+    predicted_hypotheses,
 )
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
@@ -54,6 +55,7 @@ class Verifier:
         self._settings = settings
         self._acceptance = load_acceptance(settings.calibration)
         self._memory = TemporalMemory()
+        self._predicted = 0  # keyframes since the last search
         self.scans = ScanCache()
         self.latency_ms: dict[str, float] = {}
 
@@ -64,6 +66,7 @@ class Verifier:
     def reset(self) -> None:
         """Forget earlier keyframes, as after a jump of the clock."""
         self._memory.reset()
+        self._predicted = 0
         self.scans.clear()
 
     def prefetch(self, keyframe: Keyframe) -> None:
@@ -82,17 +85,20 @@ class Verifier:
         """
         self.latency_ms = {"rerank": 0.0, "refine": 0.0}
         turned = self._turned(query) if candidates else None
-        # the candidate that odometry predicts from an accepted closure comes first: most often it suffices
-        ranked = chosen = self._rank(query, self._memory.expected(query, candidates))
-        judged = self._refine(query, chosen, turned, guesses)
-        decisive = _most_probable(judged).values()
-        if sum(self._objection(one) is None for one in decisive) < self._settings.max_closures:
-            expected = {candidate.index for candidate, _ in chosen}
+        # the candidate that odometry predicts from an accepted closure comes first, at that pose: most often it suffices
+        expected = self._memory.expected(query, candidates)
+        ranked = chosen = self._rank(query, [expected[0]] if expected else [])
+        judged = self._refine_predicted(query, chosen[0], expected[1]) if expected else []
+        if not self._suffice(judged):
+            self._predicted = 0
+            judged = self._refine(query, chosen, turned, guesses)
+        if not self._suffice(judged):
+            known = {candidate.index for candidate, _ in chosen}
             ranked = self._rank(query, candidates)
-            others = [one for one in select(ranked, self._settings.refine_best) if one[0].index not in expected]
+            others = [one for one in select(ranked, self._settings.refine_best) if one[0].index not in known]
             judged += self._refine(query, others, turned, guesses)
             chosen = chosen + others
-        self._memory.remember(query, [(one.keyframes[1], one.pose, self._probable(one)) for one in judged])
+        self._memory.remember(query, [(one.keyframes[1], one.pose, self._objection(one) is None) for one in judged])
         found = self._best(query, ranked, judged, {candidate.index for candidate, _ in chosen})
         compared = {candidate.index for candidate, _ in ranked}
         reason = RejectReason.NOT_COMPARED
@@ -113,6 +119,23 @@ class Verifier:
     def _rank(self, query: Keyframe, candidates: Sequence[Offered]) -> list[Offered]:
         with self._timed("rerank"):
             return rerank(query, candidates, self._settings)
+
+    def _suffice(self, judged: list[Hypothesis]) -> bool:
+        """Whether as many candidates as may become closures do."""
+        decisive = _most_probable(judged).values()
+        return sum(self._objection(one) is None for one in decisive) >= self._settings.max_closures
+
+    def _refine_predicted(self, query: Keyframe, offered: Offered, pose: Array) -> list[Hypothesis]:
+        """The hypothesis at the pose that odometry carries over from a closure, judged; none when a search is due.
+
+        A wrong closure must not carry itself on: every few keyframes the pose is searched as if it were unknown.
+        """
+        self._predicted += 1
+        if self._predicted % const.SEARCHED_EVERY == 0:
+            return []
+        with self._timed("refine"):
+            scans = self.scans[offered[1]], self.scans[query]
+            return self._judge(predicted_hypotheses(query, offered, scans, pose), self._settings.min_probability)
 
     def _refine(
         self, query: Keyframe, ranked: list[Offered], turned: RotatedMaps | None, guesses: Mapping[int, Array]

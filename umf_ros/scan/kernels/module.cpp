@@ -76,13 +76,13 @@ nb::tuple neighbours(const KdTree& tree, const Points& queries, int wanted) {
   return nb::make_tuple(index.of({count, width}), squared.of({count, width}));
 }
 
-nb::object normals(const KdTree& tree, int wanted) {
+nb::object normals(const KdTree& tree, const Points& places, int wanted) {
   require(0 < wanted && wanted <= KdTree::kMostNeighbours, "1 to 32 neighbours");
-  const size_t count = tree.size();
+  const size_t count = places.shape(0);
   Out<double> found(3 * count);
   {
     nb::gil_scoped_release free;
-    normals_of(tree, wanted, found.data);
+    normals_at(tree, places.data(), count, wanted, found.data);
   }
   return nb::cast(found.of({count, 3}));
 }
@@ -209,7 +209,7 @@ NB_MODULE(_kernels, module) {
       .def("__len__", &KdTree::size)
       .def("nearest", &nearest, "queries"_a)
       .def("neighbours", &neighbours, "queries"_a, "count"_a)
-      .def("normals", &normals, "neighbours"_a)
+      .def("normals", &normals, "places"_a, "neighbours"_a)
       .def("planes", &planes, "neighbours"_a);
   nb::class_<RangeImage>(module, "RangeImage")
       .def("__init__",
