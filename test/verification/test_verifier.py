@@ -317,17 +317,14 @@ def test_the_others_are_compared_where_the_expected_place_is_refuted(
     pairs = drive(np.eye(4))
     verifier.verify(pairs[0][0], [candidate(pairs[0][1])])
 
-    for name in ("_refine_predicted", "_refine"):
+    judge = Verifier._judge
 
-        def refine_with_a_refuted_one(
-            self: Verifier, *given: Any, refine: Any = getattr(Verifier, name)
-        ) -> list[Hypothesis]:
-            judged: list[Hypothesis] = refine(self, *given)
-            certain = {"probability": 1.0}
-            refuted = [replace(one, measurements=one.measurements | {"lead": 0.5}, **certain) for one in judged[:1]]
-            return judged + refuted
+    def judge_with_a_refuted_one(self: Verifier, *given: Any) -> list[Hypothesis]:
+        judged = judge(self, *given)
+        refuted = [replace(one, measurements=one.measurements | {"lead": 0.5}, probability=1.0) for one in judged[:1]]
+        return judged + refuted
 
-        monkeypatch.setattr(Verifier, name, refine_with_a_refuted_one)
+    monkeypatch.setattr(Verifier, "_judge", judge_with_a_refuted_one)
     verdicts = verifier.verify(pairs[1][0], [*others(2), candidate(pairs[1][1])])
     assert RejectReason.NOT_COMPARED not in {verdict.reason for verdict in verdicts}
 

@@ -85,7 +85,7 @@ class Verifier:
         """
         self.latency_ms = {"rerank": 0.0, "refine": 0.0}
         turned = self._turned(query) if candidates else None
-        # the candidate that odometry predicts from an accepted closure comes first, at that pose: most often that is all
+        # the candidate that odometry predicts from an accepted closure comes first, at that pose: that is mostly all
         expected = self._memory.expected(query, candidates)
         ranked = chosen = self._rank(query, [expected[0]] if expected else [])
         judged = self._refine_predicted(query, chosen[0], expected[1]) if expected else []
