@@ -95,9 +95,23 @@ class PassagePosition(NamedTuple):
 
     def compared(self, pose: Array) -> bool:
         """Whether a pose, up to its position along the passage, is this one: it was compared with it."""
-        moved = pose.copy()
-        moved[:3, 3] += (self.pose[:3, 3] - pose[:3, 3]) @ self.way * self.way
-        return near(moved, self.pose, const.DISTINCT_M, const.DISTINCT_RAD)
+        return _along(self.pose, self.way, pose)
+
+
+def _along(pose: Array, way: Array, other: Array) -> bool:
+    """Whether another pose (4, 4) is a pose up to its position along a passage."""
+    moved = other.copy()
+    moved[:3, 3] += (pose[:3, 3] - other[:3, 3]) @ way * way
+    return near(moved, pose, const.DISTINCT_M, const.DISTINCT_RAD)
+
+
+def passage_way(match: PreparedScan, query: PreparedScan, pose: Array) -> Array | None:
+    """Return the direction (3,) of the passage, match frame; None where neither scan shows one, and for submaps."""
+    if not patterned(match, query):
+        return None
+    if match.passage is None and query.passage is not None:
+        return np.asarray(pose[:3, :3] @ query.passage)
+    return match.passage
 
 
 def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> PassagePosition | None:
@@ -111,11 +125,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
         query: the query's scan.
         pose: (4, 4) `match_T_query`, a pose along the passage.
     """
-    if not patterned(match, query):
-        return None
-    way = match.passage
-    if way is None and query.passage is not None:
-        way = pose[:3, :3] @ query.passage
+    way = passage_way(match, query, pose)
     if way is None:
         return None
     along = shifted(pose, way, const.PASSAGE_SHIFTS_M)
@@ -155,6 +165,77 @@ def undisputed(found: PassagePosition, match: PreparedScan, query: PreparedScan,
     elsewhere = here.elsewhere
     needed = const.UNDISPUTED_SIGMAS if known.mean() > const.PASSAGE_KNOWN else 0.0
     return bool(elsewhere.any() and here.sigmas(rivals.misfits[elsewhere], rivals.known[elsewhere]).min() > needed)
+
+
+class FacedPosition(NamedTuple):
+    """A pose `match_T_query` in a passage that is told by surfaces which face along it.
+
+    Attributes:
+        pose: (4, 4).
+        way: (3,) direction of the passage, match frame.
+        fit: logarithm of the mean misfit of these surfaces.
+        lead: how much worse they fit elsewhere along the passage, as a share of what a closure needs.
+    """
+
+    pose: Array
+    way: Array
+    fit: float
+    lead: float
+
+    @property
+    def decides(self) -> bool:
+        """Whether it is the position of a closure."""
+        return self.lead >= 1.0
+
+    def lead_over(self, rivals: list[FacedPosition]) -> float:
+        """The lead, also over other poses of the same scans."""
+        return min([self.lead, *((one.fit - self.fit) / const.FACING_LEAD for one in rivals)])
+
+    def compared(self, pose: Array) -> bool:
+        """Whether a pose, up to its position along the passage, is this one: it was compared with it."""
+        return _along(self.pose, self.way, pose)
+
+
+def face_along(match: PreparedScan, query: PreparedScan, pose: Array) -> FacedPosition | None:
+    """Compare a pose along a passage with all others along it by the surfaces that face along it.
+
+    Walls, floor and ceiling fit anywhere, and the pattern of the sensor lies on them in the same way anywhere. Ends,
+    niches, frames and pillars fit at one position. None where too few of them are known, or there is no passage.
+
+    Args:
+        match: the matched scan.
+        query: the query's scan.
+        pose: (4, 4) `match_T_query`.
+    """
+    way = passage_way(match, query, pose)
+    if way is None:
+        return None
+    sigma_m = max(const.FACING_SIGMA_M, const.PLANE_SIGMA_M + 2 * common_blur(match, query))
+    poses = np.concatenate([pose[None], shifted(pose, way, const.FACING_SHIFTS_M)])
+    parts = [
+        _misfits_with(scan, planes, points, at, sigma_m)
+        for scan, other, at, ahead in (
+            (match, query, poses, pose[:3, :3].T @ way),
+            (query, match, invert(poses), way),
+        )
+        for planes, points in zip(scan.surfaces, _facing(other, ahead), strict=True)
+    ]
+    misfits, known = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
+    counts = known.sum(axis=1)
+    fits = np.log(misfits.sum(axis=1) / np.maximum(counts, 1) + const.MISFIT_FLOOR)
+    rivals = fits[1:][counts[1:] >= max(const.FEWEST_FACING, const.PASSAGE_COMMON * counts[0])]
+    if counts[0] < const.FEWEST_FACING or not len(rivals):
+        return None
+    return FacedPosition(pose, way, float(fits[0]), float(rivals.min() - fits[0]) / const.FACING_LEAD)
+
+
+def _facing(scan: PreparedScan, way: Array) -> list[Array]:
+    """Some points (N, 3) of each half of a scan, in the order of `_halves`, on planes that face along a direction."""
+    found = []
+    for half in reversed(scan.surfaces):
+        points = half.points[half.planar & (np.abs(half.normals @ way) > const.FACING_COS)]
+        found.append(points[evenly(len(points), const.FACING_POINTS)])
+    return found
 
 
 def _metres(match: PreparedScan, query: PreparedScan, way: Array, pose: Array) -> NDArray[np.int64]:

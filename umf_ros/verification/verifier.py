@@ -16,7 +16,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
-from umf_ros.verification.passages import PassagePosition, locate_along, undisputed
+from umf_ros.verification.passages import FacedPosition, PassagePosition, face_along, locate_along, undisputed
 from umf_ros.verification.pose_search import (
     RotatedMaps,
     TemporalMemory,
@@ -29,6 +29,7 @@ from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans, inspect
 from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, repetition
 
+Position = PassagePosition | FacedPosition
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 
 
@@ -179,7 +180,7 @@ class Verifier:
         others = [one for one in hypotheses[const.MAX_REFINED :] if any(one.candidate is it for it in promising)]
         aligned += self._aligned(others, aligned)
         judged: list[Hypothesis] = []
-        passages: list[tuple[Hypothesis, PassagePosition]] = []
+        passages: list[tuple[Hypothesis, Position]] = []
         for one in aligned:
             promises, earlier = self._promises(one, least), _along(one, passages)
             if earlier and not (promises and self._replaces(one, earlier[1])):
@@ -210,18 +211,27 @@ class Verifier:
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
     @staticmethod
-    def _replaces(hypothesis: Hypothesis, found: PassagePosition) -> bool:
-        """Whether a hypothesis stands for its passage, where another before it found no position along it."""
+    def _replaces(hypothesis: Hypothesis, found: Position) -> bool:
+        """Whether a hypothesis stands for its passage in place of another before it."""
         theirs, ours = hypothesis.scans
+        faced = face_along(theirs, ours, hypothesis.pose)
+        if isinstance(found, FacedPosition):
+            return faced is not None and faced.fit < found.fit
+        if faced is not None:
+            return faced.decides
         return not found.decides and undisputed(found, theirs, ours, hypothesis.pose)
 
-    def _look_elsewhere(self, hypothesis: Hypothesis, compared: PassagePosition | None) -> PassagePosition | None:
+    def _look_elsewhere(self, hypothesis: Hypothesis, compared: Position | None) -> Position | None:
         """Compare with other poses; of scans in a passage, move to the best position along it, and return that.
 
         `compared` is of an earlier hypothesis along the passage, which this one replaces.
         """
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
+        if (faced := face_along(theirs, ours, hypothesis.pose)) is not None:
+            hypothesis.measurements["lead"] = faced.lead  # the probability is that of a pose in a passage
+            return faced
+        assert not isinstance(compared, FacedPosition)
         found = compared or locate_along(theirs, ours, hypothesis.pose)
         if found is not None and (compared or undisputed(found, theirs, ours, hypothesis.pose)):
             found = found._replace(pose=hypothesis.pose, undisputed=True)
@@ -230,7 +240,7 @@ class Verifier:
             return found
         hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
         self._measure(hypothesis)
-        hypothesis.measurements["lead"] = found.lead  # the probability is that of a pose in a passage
+        hypothesis.measurements["lead"] = found.lead
         return found
 
     @staticmethod
@@ -331,17 +341,18 @@ def _most_probable(judged: list[Hypothesis]) -> dict[int, Hypothesis]:
 
 
 def _along(
-    hypothesis: Hypothesis, passages: list[tuple[Hypothesis, PassagePosition]]
-) -> tuple[Hypothesis, PassagePosition] | None:
+    hypothesis: Hypothesis, passages: list[tuple[Hypothesis, Position]]
+) -> tuple[Hypothesis, Position] | None:
     """Return the hypothesis about the same candidate whose positions along a passage this one's pose is among."""
     same = (one for one in passages if one[0].candidate is hypothesis.candidate)
     return next((one for one in same if one[1].compared(hypothesis.pose)), None)
 
 
-def _compare_headings(passages: list[tuple[Hypothesis, PassagePosition]]) -> None:
+def _compare_headings(passages: list[tuple[Hypothesis, Position]]) -> None:
     """Of hypotheses in a passage, count the other heading of the same candidate as a rival."""
     for one, found in passages:
-        if found.undisputed:
-            continue
         turned = [its for other, its in passages if other is not one and other.candidate is one.candidate]
-        one.measurements["lead"] = found.lead_over(turned)
+        if isinstance(found, FacedPosition):
+            one.measurements["lead"] = found.lead_over([its for its in turned if isinstance(its, FacedPosition)])
+        elif not found.undisputed:
+            one.measurements["lead"] = found.lead_over([its for its in turned if isinstance(its, PassagePosition)])
