@@ -175,12 +175,14 @@ class FacedPosition(NamedTuple):
         way: (3,) direction of the passage, match frame.
         fit: logarithm of the mean misfit of these surfaces.
         lead: how much worse they fit elsewhere along the passage, as a share of what a closure needs.
+        rival: (4, 4) the pose elsewhere along it at which they fit best.
     """
 
     pose: Array
     way: Array
     fit: float
     lead: float
+    rival: Array
 
     @property
     def decides(self) -> bool:
@@ -223,10 +225,11 @@ def face_along(match: PreparedScan, query: PreparedScan, pose: Array) -> FacedPo
     misfits, known = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
     counts = known.sum(axis=1)
     fits = np.log(misfits.sum(axis=1) / np.maximum(counts, 1) + const.MISFIT_FLOOR)
-    rivals = fits[1:][counts[1:] >= max(const.FEWEST_FACING, const.PASSAGE_COMMON * counts[0])]
-    if counts[0] < const.FEWEST_FACING or not len(rivals):
+    fits[1:][counts[1:] < max(const.FEWEST_FACING, const.PASSAGE_COMMON * counts[0])] = np.inf
+    best = 1 + int(fits[1:].argmin())
+    if counts[0] < const.FEWEST_FACING or not np.isfinite(fits[best]):
         return None
-    return FacedPosition(pose, way, float(fits[0]), float(rivals.min() - fits[0]) / const.FACING_LEAD)
+    return FacedPosition(pose, way, float(fits[0]), float(fits[best] - fits[0]) / const.FACING_LEAD, poses[best])
 
 
 def _facing(scan: PreparedScan, way: Array) -> list[Array]:

@@ -185,8 +185,12 @@ class Verifier:
             promises, earlier = self._promises(one, least), _along(one, passages)
             if earlier and not (promises and self._replaces(one, earlier[1])):
                 continue
-            one.measurements |= runner_up(one, [other for other in aligned if other.candidate is one.candidate])
+            rivals = [other for other in aligned if other.candidate is one.candidate]
+            one.measurements |= runner_up(one, rivals)
             found = self._look_elsewhere(one, earlier[1] if earlier else None) if promises else None
+            if isinstance(found, FacedPosition):  # of the others along the passage that has decided
+                one.measurements.pop("runner_up", None)
+                one.measurements |= runner_up(one, [other for other in rivals if not found.compared(other.pose)])
             if earlier:
                 passages.remove(earlier)
                 judged.remove(earlier[0])
@@ -229,6 +233,10 @@ class Verifier:
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
         if (faced := face_along(theirs, ours, hypothesis.pose)) is not None:
+            if faced.lead < 0.0:
+                self._align(hypothesis, faced.rival)
+                self._measure(hypothesis)
+                faced = face_along(theirs, ours, hypothesis.pose) or faced
             hypothesis.measurements["lead"] = faced.lead  # the probability is that of a pose in a passage
             return faced
         assert not isinstance(compared, FacedPosition)
@@ -273,19 +281,19 @@ class Verifier:
         for one in hypotheses:
             ends = [other.pose for other in before + kept if other.candidate is one.candidate]
             if not any(same_pose(one.pose, end) for end in ends):
-                self._align(one)
+                self._align(one, one.pose)
                 if not any(same_pose(one.pose, end) for end in ends):
                     self._measure(one)
                     kept.append(one)
         return kept
 
-    def _align(self, hypothesis: Hypothesis) -> None:
+    def _align(self, hypothesis: Hypothesis, guess: Array) -> None:
         query, match = hypothesis.keyframes
         scans = self.scans[match], self.scans[query]
         if hypothesis.views is not None:
-            hypothesis.alignment = hypothesis.views.align(hypothesis.pose)
+            hypothesis.alignment = hypothesis.views.align(guess)
         else:
-            hypothesis.scans, hypothesis.alignment = scans, align_scans(*scans, hypothesis.pose)
+            hypothesis.scans, hypothesis.alignment = scans, align_scans(*scans, guess)
         hypothesis.pose = hypothesis.alignment.pose
 
     def _best(
