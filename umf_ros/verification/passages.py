@@ -174,15 +174,25 @@ class FacedPosition(NamedTuple):
         pose: (4, 4).
         way: (3,) direction of the passage, match frame.
         fit: logarithm of the mean misfit of these surfaces.
-        lead: how much worse they fit elsewhere along the passage, as a share of what a closure needs.
-        rival: (4, 4) the pose elsewhere along it at which they fit best.
+        worse: how much larger it is elsewhere along the passage.
+        evidence: number of points that fit here and not there, at the rival that fits most of them.
+        better: (4, 4) the pose elsewhere at which they fit best, where that is better than here.
+        rival_far: as in `ambiguity`, of all points; 0 while it is unknown.
     """
 
     pose: Array
     way: Array
     fit: float
-    lead: float
-    rival: Array
+    worse: float
+    evidence: float
+    better: Array | None
+    rival_far: float = 0.0
+
+    @property
+    def lead(self) -> float:
+        """How much worse the scans fit elsewhere, as a share of what a closure needs."""
+        both = self.evidence + const.FACING_POINT * self.rival_far
+        return min(self.worse / const.FACING_LEAD, self.evidence / const.FACING_LEAST, both)
 
     @property
     def decides(self) -> bool:
@@ -225,11 +235,14 @@ def face_along(match: PreparedScan, query: PreparedScan, pose: Array) -> FacedPo
     misfits, known = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
     counts = known.sum(axis=1)
     fits = np.log(misfits.sum(axis=1) / np.maximum(counts, 1) + const.MISFIT_FLOOR)
-    fits[1:][counts[1:] < max(const.FEWEST_FACING, const.PASSAGE_COMMON * counts[0])] = np.inf
-    best = 1 + int(fits[1:].argmin())
-    if counts[0] < const.FEWEST_FACING or not np.isfinite(fits[best]):
+    rivals = 1 + np.flatnonzero(counts[1:] >= max(const.FEWEST_FACING, const.PASSAGE_COMMON * counts[0]))
+    if counts[0] < const.FEWEST_FACING or not len(rivals):
         return None
-    return FacedPosition(pose, way, float(fits[0]), float(fits[best] - fits[0]) / const.FACING_LEAD, poses[best])
+    best = rivals[fits[rivals].argmin()]
+    # what repeats is seen here, and there from another side: the same points have to tell both apart
+    evidence = np.where(known[rivals] & known[0], misfits[rivals] - misfits[0], 0.0).sum(axis=1).min()
+    worse, better = float(fits[best] - fits[0]), poses[best] if fits[best] < fits[0] else None
+    return FacedPosition(pose, way, float(fits[0]), worse, float(evidence), better)
 
 
 def _facing(scan: PreparedScan, way: Array) -> list[Array]:

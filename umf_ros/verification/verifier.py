@@ -188,7 +188,7 @@ class Verifier:
             rivals = [other for other in aligned if other.candidate is one.candidate]
             one.measurements |= runner_up(one, rivals)
             found = self._look_elsewhere(one, earlier[1] if earlier else None) if promises else None
-            if isinstance(found, FacedPosition):  # of the others along the passage that has decided
+            if isinstance(found, FacedPosition):  # those along the passage have been compared
                 one.measurements.pop("runner_up", None)
                 one.measurements |= runner_up(one, [other for other in rivals if not found.compared(other.pose)])
             if earlier:
@@ -233,10 +233,12 @@ class Verifier:
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
         if (faced := face_along(theirs, ours, hypothesis.pose)) is not None:
-            if faced.lead < 0.0:
-                self._align(hypothesis, faced.rival)
+            if faced.better is not None:
+                self._align(hypothesis, faced.better)
                 self._measure(hypothesis)
                 faced = face_along(theirs, ours, hypothesis.pose) or faced
+            of_points = ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
+            faced = faced._replace(rival_far=of_points["rival_far"])
             hypothesis.measurements["lead"] = faced.lead  # the probability is that of a pose in a passage
             return faced
         assert not isinstance(compared, FacedPosition)
