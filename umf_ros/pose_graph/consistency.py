@@ -117,10 +117,11 @@ def loops_between(one: Closures, others: Closures) -> Loops:
 
 
 def paths_between(one: Closures, other: Closures) -> Array:
-    """Return (2, N) path lengths in m between matches and between queries of closures; infinite between sessions."""
+    """Return (2, N) path lengths in m between matches and between queries of closures; infinite between their parts."""
     found = []
     for a, b in ((one["match"], other["match"]), (one["query"], other["query"])):
-        found.append(np.where(a["session"] == b["session"], np.abs(a["travel"] - b["travel"]), np.inf))
+        is_joined = (a["session"] == b["session"]) & (a["part"] == b["part"])
+        found.append(np.where(is_joined, np.abs(a["travel"] - b["travel"]), np.inf))
     return np.stack(found)
 
 

@@ -13,6 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError
@@ -34,6 +36,7 @@ from umf_ros.pose_graph.consistency import (
     likelihood_ratio,
     squared_mahalanobis,
 )
+from umf_ros.pose_graph.odometry import Rows
 from umf_ros.pose_graph.sessions import RelativeCovariances, Sessions
 
 _LOOPS_PER_CLOSURE = 3
@@ -76,7 +79,7 @@ class OutlierRejection:
         self._map: RelativeCovariances | None = None
         self._is_rough = self._is_outdated = False  # outdated: without some accepted closures that agree with it
         self._ratios: list[float] = []  # likelihood of how closures fit the map if wrong over that if right
-        self._joined: list[bool] = []  # whether the map joins both endpoints
+        self._joined: list[bool] = []  # whether the map joins both endpoints, by more than odometry across a silence
         self._near_map: list[int] = []
 
     @property
@@ -264,9 +267,9 @@ class OutlierRejection:
         agree with the estimated one, the less likely is the other.
 
         Returns:
-            (N,) squared Mahalanobis distances, misfits in metres, whether the map joins the endpoints, likelihoods of
-            this distance for a wrong closure over that for a right one, false-alarm probabilities, and squared
-            Mahalanobis distances by the widest plausible noise.
+            (N,) squared Mahalanobis distances, misfits in metres, whether the map joins the endpoints by more than
+            odometry across a silence, likelihoods of this distance for a wrong closure over that for a right one,
+            false-alarm probabilities, and squared Mahalanobis distances by the widest plausible noise.
         """
         assert self._map is not None
         chosen = self.closures[rows]
@@ -283,7 +286,19 @@ class OutlierRejection:
         agreed = {self._consistency.place_of[row] for row in np.flatnonzero(self._of(ClosureReason.AGREES))}
         unlikely = likelihood_ratio((2 + len(agreed)) * too_wide, wide[joined], self.settings)
         ratios[joined] = np.where(distances[joined] > self.settings.gate_chi2, unlikely, np.minimum(usual, unlikely))
-        return distances, metres, joined, ratios, false_alarms, wide
+        return distances, metres, joined & self._join_parts(rows), ratios, false_alarms, wide
+
+    def _join_parts(self, rows: Rows) -> NDArray[np.bool_]:
+        """Return (N,) whether accepted closures, or odometry without a silence, join the endpoints of closures."""
+        accepted = np.flatnonzero(self._of(State.ACCEPTED))
+        chosen = [self.closures[end][np.concatenate([accepted, rows])] for end in ("match", "query")]
+        ends = np.concatenate([np.stack([end["session"], end["part"]], axis=1) for end in chosen])
+        parts, of = np.unique(ends, axis=0, return_inverse=True)
+        match, query = of.reshape(2, -1)
+        links = match[: len(accepted)], query[: len(accepted)]
+        joins = csr_matrix((np.ones(len(accepted)), links), shape=(len(parts), len(parts)))
+        labels = connected_components(joins, directed=False)[1]
+        return np.asarray(labels[match[len(accepted) :]] == labels[query[len(accepted) :]])
 
     def _misfits(self, rows: NDArray[np.int64]) -> Array:
         """Return (N, 4, 4) residual poses: queries of closures by the map, relative to their poses by the closures."""
@@ -381,7 +396,9 @@ class OutlierRejection:
         prior = (_COUNTED * (1 - right) + rejected) / (_COUNTED * right + accepted)
         odds = odds * np.exp(-self._consistency.consistency_set(place[0], self._of(State.PENDING))[1])
         if not self._joined[place[0]]:
-            return odds * max(prior, 1 / _USUALLY_RIGHT - 1) * _WRONG_BETWEEN
+            placed = self.placed[place[0]]
+            least = 0.0 if placed.match == placed.query else 1 / _USUALLY_RIGHT - 1
+            return odds * max(prior, least) * _WRONG_BETWEEN
         # of those that contradict the estimated noise most are wrong, and single ones too
         is_usual = self.verdicts[place[0]].residual ** 2 <= self.settings.gate_chi2
         return odds * prior * (_WRONG_ALONE if len(place) == 1 and is_usual else 1.0)
