@@ -206,9 +206,9 @@ class PoseGraphNode(BaseNode):
         self._worker.submit(self._take, needed=True, once=True)
 
     def _take(self) -> None:
-        """Pass queued inputs to the graph, and go on deciding; the odometry's correction is that of its session."""
+        """Pass queued inputs to the graph, and decide once none waits; the odometry's correction is of its session."""
         batch = [self._inbox.popleft() for _ in range(min(len(self._inbox), AT_ONCE))]
-        verdicts, resets = self._durable.take([item for item, _ in batch], DECIDE_S)
+        verdicts, resets = self._durable.take([item for item, _ in batch], 0.0 if self._inbox else DECIDE_S)
         for reset in resets:
             self.get_logger().warning(f"{reset.reason}: a new session begins")
         session = max([self._corrected, *(session for _, session in batch)])

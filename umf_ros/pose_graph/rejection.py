@@ -43,6 +43,8 @@ _LOOPS_PER_CLOSURE = 3
 _MOST_ROUNDS = 4
 # a rejected closure further than this from the moved map (m) is not compared again
 _CLOSE_M = 2.0
+# closures that may be accepted as unopposed in one step, the newest, so that a step costs the same however many wait
+_MOST_WAITING = 100
 # largest odds against a closure without support: during the drive, and at the end; .1 during the drive accepts a group
 # of aliases in 2 of 42 cells of `pose_graph.py` with seed 25501, .03 none, and both accept all right closures
 _MOST_ODDS, _MOST_ODDS_AT_LAST = 0.03, 0.2
@@ -367,6 +369,7 @@ class OutlierRejection:
             queries = self.closures["query"]
             waited_m = queries["travel"][-1] - queries["travel"]
             waiting &= (queries["session"] != queries["session"][-1]) | (waited_m >= self.settings.patience_m)
+            waiting[np.flatnonzero(waiting)[:-_MOST_WAITING]] = False
         companions = ~self._of(State.ACCEPTED) & ~self._revoked
         places = [[row, *self._consistency.companions(row, companions)] for row in np.flatnonzero(waiting).tolist()]
         self._gate(sorted({member for place in places for member in place}))
