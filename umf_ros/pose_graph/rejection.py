@@ -43,7 +43,7 @@ _LOOPS_PER_CLOSURE = 3
 _MOST_ROUNDS = 4
 # a rejected closure further than this from the moved map (m) is not compared again
 _CLOSE_M = 2.0
-# closures that may be accepted as unopposed in one step, the newest, so that a step costs the same however many wait
+# closures that are compared again, or accepted as unopposed, in one step: its cost does not grow with those that wait
 _MOST_WAITING = 100
 # largest odds against a closure without support: during the drive, and at the end; .1 during the drive accepts a group
 # of aliases in 2 of 42 cells of `pose_graph.py` with seed 25501, .03 none, and both accept all right closures
@@ -82,7 +82,7 @@ class OutlierRejection:
         self._is_rough = self._is_outdated = False  # outdated: without some accepted closures that agree with it
         self._ratios: list[float] = []  # likelihood of how closures fit the map if wrong over that if right
         self._joined: list[bool] = []  # whether the map joins both endpoints, by more than odometry across a silence
-        self._near_map: list[int] = []
+        self._again: set[int] = set()  # closures to compare again with the moved map
 
     @property
     def scale(self) -> NoiseScale:
@@ -116,7 +116,7 @@ class OutlierRejection:
         """Add closures; return the verdicts that are new or changed.
 
         The map is solved twice at most, roughly, and not at all if every closure agrees with it. Closures near the
-        moved map are compared by the next call.
+        moved map are compared by the next calls, the newest first: the cost does not grow with their number.
         """
         before = list(self.verdicts)
         rows = [self._take(placed) for placed in arrived]
@@ -125,8 +125,8 @@ class OutlierRejection:
         widened = self._map is not None and self._estimator.widest > self._map.widest
         if self._rescale() or unsolved or widened or (rows and begun):
             self.solve(rough=True)
-            rows = list(range(len(self.placed)))
-        self._decide({*rows, *self._near_map})
+            self._again = set(range(len(self.placed)))
+        self._decide({*rows, *sorted(self._again)[-_MOST_WAITING:]})
         return self._changed_since(before)
 
     def refine(self) -> None:
@@ -195,7 +195,7 @@ class OutlierRejection:
                 return
             if self._is_outdated:
                 self.solve(rough=True)
-            rows = self._near_map
+            rows = set(self._again)
 
     def _decide(self, rows: Iterable[int]) -> bool:
         """Decide about closures and solve the map with the accepted ones; return false without any.
@@ -203,7 +203,8 @@ class OutlierRejection:
         Closures that agree with the map leave it as it is: its bounds hold without them, only wider. It is solved with
         them once another closure does not agree with it, or contradicts one of them.
         """
-        rows, self._near_map = sorted(rows), []
+        rows = sorted(rows)
+        self._again.difference_update(rows)
         agreed, accepted = self._gate(rows), self._of(State.ACCEPTED)
         opposed = any(self._consistency.opponents(row, accepted) for row in agreed)
         if self._is_outdated and (opposed or len(agreed) < (~accepted & ~self._revoked)[rows].sum()):
@@ -433,7 +434,7 @@ class OutlierRejection:
         self._is_rough, self._is_outdated = rough, False
         self._map = RelativeCovariances(self._sessions, self._estimator.widest)
         rows = np.flatnonzero(~self._of(State.ACCEPTED) & ~self._revoked)
-        self._near_map = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
+        self._again.update(rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist())
 
     def _reject(self, row: int, reason: ClosureReason) -> None:
         self.verdicts[row] = ClosureVerdict(self.placed[row].closure, State.REJECTED, reason)
