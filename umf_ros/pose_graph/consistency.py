@@ -13,6 +13,7 @@ worse than stated: no single place decides about that.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,6 +51,8 @@ _LEAST_ODOMETRY = 0.3
 # nats below the likeliest factor that are still plausible
 _PLAUSIBLE = 2.0
 _AT_ONCE = 64
+# closures, the latest, whose loops are weighted again: enough for the noise of an axis, in a quarter of a second
+_MOST_WEIGHTED_AGAIN = 300
 
 
 @dataclass(frozen=True)
@@ -256,7 +259,7 @@ class NoiseScaleEstimator:
         # one decade off is two sigmas: a few loops cannot move a stated covariance
         self._likelihood = -0.5 * ((logs[:, None] / 1.15) ** 2 + (logs[None, :] / 1.15) ** 2)
         self._prior = self._of_axis = np.stack([self._likelihood] * _DEGREES)
-        self._spread: list[Loops] = []
+        self._spread: deque[Loops] = deque(maxlen=_MOST_WEIGHTED_AGAIN)
         self._factors = len(logs) // 2, len(logs) // 2  # with which loops are weighted
         self._of_place: dict[int, Array] = {}
         self.loops = 0
@@ -274,7 +277,7 @@ class NoiseScaleEstimator:
         self._likelihood = self._likelihood + new
         self.loops += len(latest)
         # a loop counts for single axes as far as all together take it for right, by the stated noise at least: the
-        # first loops may all be wrong, so that all are weighted again when the likeliest factors change
+        # first loops may all be wrong, so that the latest are weighted again when the likeliest factors change
         odometry, closures = divmod(int(np.argmax(self._likelihood)), len(_GRID))
         factors = max(odometry, len(_GRID) // 2), closures
         self._spread.append(spread)
