@@ -68,11 +68,10 @@ EXPLAINED_S = 5.0
 def right_sessions(odometry: Trajectory, case: str, gap_s: float) -> tuple[int, ...]:
     """Return the numbers of sessions that are right; a restart without odometry after it begins none."""
     moments, move = CASES[case]
-    duration_s = (odometry.stamps_ns[-1] - odometry.stamps_ns[0]) / 1e9
-    begun = 1 + sum(share * duration_s + gap_s < duration_s for share in moments)
-    if case == "carried on":
-        return (1,)
-    return (begun,) if move is _restart or gap_s < EXPLAINED_S else (1, begun)
+    first, last = odometry.stamps_ns[[0, -1]].tolist()
+    begun = np.searchsorted(first + np.array(moments) * (last - first), disturbed(odometry, case, gap_s).stamps_ns)
+    count = 1 if case == "carried on" else len(np.unique(begun))
+    return (count,) if move is _restart or gap_s < EXPLAINED_S else (1, count)
 
 
 def disturbed(odometry: Trajectory, case: str, gap_s: float) -> Trajectory:
