@@ -16,6 +16,7 @@ from umf_ros.durable_graph import DurableGraph
 from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.live.live_graph import settle_left
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
+from umf_ros.pose_graph.closures import ClosureReason
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import CONFIRMING
 
@@ -259,3 +260,13 @@ def test_decisions_by_hand_are_there_again_until_they_are_undone(world: GraphWor
     last_one = made(tmp_path / "graph.sqlite")
     assert (match, query, before) in states(last_one)
     last_one.close()
+
+
+def test_closures_without_time_wait_and_the_next_call_decides_about_them(world: GraphWorld) -> None:
+    graph = made(None)
+    graph.take([OdometrySample(k * PERIOD_NS, pose) for k, pose in enumerate(world.odometry)])
+    closures = [world.message(row) for row in range(len(world.closures))]
+    verdicts, _ = graph.take(closures, 0.0)
+    assert {verdict.reason for verdict in verdicts} == {ClosureReason.NOT_DECIDED_YET}
+    assert graph.graph.undecided == len(closures)
+    assert {verdict.state for verdict in graph.take([])[0]} >= {State.ACCEPTED} and not graph.graph.undecided

@@ -126,7 +126,8 @@ class DurableGraph:
     ) -> tuple[list[ClosureVerdict], list[Reset]]:
         """Add inputs; return the verdicts that they caused or changed, and the resets of sessions that begin.
 
-        All are logged before closures are decided about, which ends when the time is up; `update` goes on with that.
+        All are logged before closures are decided about, which ends when the time is up; the next call goes on with
+        that, and none begins without time.
         """
         rows, verdicts, resets = list[tuple[Any, ...]](), list[ClosureVerdict](), list[Reset]()
         for kind, group in groupby(inputs, key=type):
@@ -144,7 +145,7 @@ class DurableGraph:
         if rows:
             self._write((_EVENT, rows))
         self._condense()
-        if verdicts:
+        if within_s > 0 and (verdicts or self.graph.undecided):
             decided = self.graph.decide(within_s)
             changed = {id(verdict.closure) for verdict in decided}
             verdicts = [verdict for verdict in verdicts if id(verdict.closure) not in changed] + decided

@@ -148,10 +148,10 @@ def kill_both(folder: Path, kills: int, bag: Path, config: Path, rng: np.random.
     Every closure in the front-end's table needs a verdict then, and no closure may count twice.
     """
     results = _fresh(folder, "both")
-    parameters: dict[str, object] = {"database.path": results / "places.sqlite"}
+    parameters: dict[str, object] = {"database.path": results / "places.sqlite", "dataset": "simulated"}
     crashes, nodes = 0, dict[str, NodeUnderTest]()
     with own_domain():
-        ears, player = Ears(), play(bag, "--rate", "0.5")
+        ears, player = Ears(), play(bag, "--rate", "0.25")
         for number in range(kills + 1):
             for name in (FRONT_END, BACK_END):
                 if name not in nodes:

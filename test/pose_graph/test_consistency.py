@@ -8,8 +8,16 @@ from graph_worlds import SETTINGS, chain_of, closing, lap_pairs, placed, two_lap
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.lab.simulation.pose_graphs import GraphWorld
-from umf_ros.pose_graph.closures import as_closures
-from umf_ros.pose_graph.consistency import ConsistencyGraph, NoiseScale, false_alarm_ratio, likelihood_ratio
+from umf_ros.pose_graph import consistency
+from umf_ros.pose_graph.closures import Closures, as_closures
+from umf_ros.pose_graph.consistency import (
+    ConsistencyGraph,
+    Loops,
+    NoiseScale,
+    false_alarm_ratio,
+    likelihood_ratio,
+    loops_between,
+)
 
 ASIDE = (4.0, 3.0, 0.0)
 
@@ -139,3 +147,25 @@ def test_a_false_alarm_is_the_share_of_the_area_that_wrong_closures_fall_in(
     covariance = np.diag([1e-4] * 3 + [along_m**2, across_m**2, 1e-6])
     share = false_alarm_ratio(covariance[None], PoseGraphSettings(gate_chi2=27.9, alias_radius_m=15.0))[0]
     assert share == pytest.approx(expected, rel=0.01)
+
+
+def test_another_scale_is_compared_with_once_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, scale = closing(two_laps(), lap_pairs(*range(0, 60, 3))), NoiseScale(16.0, 8.0)
+    graph, chain, expected = compared(world), chain_of(world, SETTINGS, 1.0), ConsistencyGraph(SETTINGS)
+    expected.compare_all(scale)
+    for row, closure in enumerate(placed(world)):
+        expected.add(as_closures(closure, row, [chain]))
+    before, loops = graph.consistency_set(9, everyone(world)), list[int]()
+
+    def counted(one: Closures, others: Closures) -> Loops:
+        loops.append(len(others))
+        return loops_between(one, others)
+
+    monkeypatch.setattr(consistency, "loops_between", counted)
+    graph.compare_all(scale)
+    assert not loops
+    for row in range(len(world.closures)):
+        found, evidence = graph.consistency_set(row, everyone(world))
+        assert (found, pytest.approx(evidence)) == expected.consistency_set(row, everyone(world))
+        assert graph.opponents(row, everyone(world)) == expected.opponents(row, everyone(world))
+    assert len(loops) == len(world.closures) and graph.consistency_set(9, everyone(world)) != before

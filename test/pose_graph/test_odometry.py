@@ -105,6 +105,26 @@ def test_a_step_that_jumps_is_as_uncertain_as_it_is_too_long(jump: tuple[float, 
     assert jumped[4] == pytest.approx(np.hypot(smooth[4], distance + 8 * angle), rel=0.1)
 
 
+@pytest.mark.parametrize("silence_s", [0.5, 10.0, 600.0])
+def test_a_step_over_a_silence_is_as_uncertain_as_the_recent_speed_allows(silence_s: float) -> None:
+    chain, poses = OdometryChain(PoseGraphSettings()), line(200)  # 2 m/s
+    stamps = np.arange(200) * 50_000_000 + np.where(np.arange(200) >= 100, round(silence_s * 1e9), 0)
+    smooth = end_sigmas(driven_chain(poses[:100]))
+    for end in (100, 200):
+        chain.extend(stamps[end - 100 : end], poses[end - 100 : end])
+        chain.update()
+        if end == 100:
+            np.testing.assert_allclose(end_sigmas(chain), smooth)
+    # until 2 s the motion is limited by accelerations, from a minute on it is told by the reset of the session
+    free_s = min(silence_s + 0.05, 60.0)
+    points = chain.at(stamps[[0, 99, 100]])
+    before, over = (np.sqrt(np.diagonal(noise)) for noise in np.diff(points["noise"], axis=0))
+    np.testing.assert_allclose(before[:4], smooth[:4], rtol=0.05)
+    assert over[2] == pytest.approx(min(0.3 * free_s * min(free_s / 2, 1.0), np.pi), rel=0.1)
+    assert over[3] == pytest.approx(2.0 * free_s * min(free_s / 2, 1.0), rel=0.1)
+    assert np.diff(points["part"]).tolist() == [0, silence_s > 2.0]
+
+
 def test_starts_stops_and_turns_of_a_rover_are_no_jumps() -> None:
     speed = np.concatenate([np.zeros(40), np.full(40, 2.0), np.zeros(40), np.full(40, -1.5)]) * 0.05
     rate = np.concatenate([np.zeros(60), np.full(30, 1.5), np.full(70, -1.0)]) * 0.05

@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graph_worlds import CLOSURE_COVARIANCE, SETTINGS, accepted, closing, feed_odometry, lap_pairs, rms, two_laps
+from numpy.typing import NDArray
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError
-from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, WorldClosure
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, WorldClosure, rover_loops
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureVerdict, State
+from umf_ros.pose_graph.consistency import ConsistencyGraph
 
 TURN = np.array([0, 0, np.deg2rad(0.3), 0.03, 0, 0])
 """Error per metre of odometry with a bias."""
@@ -278,6 +280,28 @@ def test_a_closure_before_all_odometry_waits_for_it() -> None:
             assert graph.update() == []
     graph.settle()
     assert graph.verdict_counts() == {State.ACCEPTED: 1}
+
+
+def test_the_cost_of_a_decision_does_not_grow_with_the_closures_that_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, rng = rover_loops(300, 4), np.random.default_rng(4)
+    graph, message = driven(world, SETTINGS.model_copy(update={"patience_m": 0.0})), world.message(0)
+    pairs = np.sort(rng.permuted(np.tile(np.arange(300), (400, 1)), axis=1)[:, :2], axis=1) * PERIOD_NS
+    wrong = [replace(message, match_stamp_ns=match, query_stamp_ns=query) for match, query in pairs.tolist()]
+    compared: list[int] = []
+    companions = ConsistencyGraph.companions
+
+    def counted(self: ConsistencyGraph, row: int, members: NDArray[np.bool_]) -> list[int]:
+        compared.append(row)
+        return companions(self, row, members)
+
+    monkeypatch.setattr(ConsistencyGraph, "companions", counted)
+    costs = []
+    for first in range(0, 400, 20):
+        compared.clear()
+        graph.add_closures(wrong[first : first + 20])
+        costs.append(len(compared))
+    assert graph.verdict_counts()[State.PENDING] > 300
+    assert max(costs[10:]) <= max(costs[:10])
 
 
 def test_what_a_person_accepts_stays_until_it_is_undone() -> None:

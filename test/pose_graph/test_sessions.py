@@ -82,6 +82,41 @@ def test_wrong_closures_between_sessions_are_told_from_right_ones() -> None:
     assert accepted(graph) == {(c.first, c.second) for c in world.closures if c.right}
 
 
+SILENCE_NS = 30 * PERIOD_NS
+
+
+def drive_with_silence(world: GraphWorld, moved: Array) -> PoseGraph:
+    """The second lap after 30 s of silence, its odometry moved meanwhile by (4, 4) in the axes of the body."""
+
+    def stamp(k: int) -> int:
+        return k * PERIOD_NS + (SILENCE_NS if k >= LAP else 0)
+
+    graph, odometry = PoseGraph(SETTINGS), world.odometry.copy()
+    odometry[LAP:] = odometry[LAP] @ moved @ invert(odometry[LAP]) @ odometry[LAP:]
+    for k, pose in enumerate(odometry):
+        graph.add_odometry(stamp(k), pose)
+    for row, closure in enumerate(world.closures):
+        told = world.message(row)
+        graph.add_closure(replace(told, match_stamp_ns=stamp(closure.first), query_stamp_ns=stamp(closure.second)))
+    graph.settle()
+    return graph
+
+
+@pytest.mark.parametrize("moved", [(0, 0, 0, 0, 0, 0), (0, 0, np.pi / 2, 0, 0, 0), (0, 0, -1.0, 25, -10, 0)])
+def test_odometry_that_jumped_during_a_silence_is_corrected_by_closures(moved: tuple[float, ...]) -> None:
+    world = closing(two_laps(), lap_pairs(0, 15, 30, 45))
+    graph = drive_with_silence(world, expmap(np.array([moved]))[0])
+    assert len(accepted(graph)) == 4 and len(graph.session_spans()) == 1
+    stamps = np.arange(len(world.truth)) * PERIOD_NS + SILENCE_NS * (np.arange(len(world.truth)) >= LAP)
+    poses, known = graph.poses_at(stamps)
+    assert known.all() and rms(poses, world.truth) < 1.0
+
+
+def test_wrong_closures_of_one_place_are_not_accepted_across_a_silence() -> None:
+    world = closing(two_laps(), lap_pairs(0, 2, 4, 6), (8.0, 0, 0))
+    assert not accepted(drive_with_silence(world, np.eye(4)))
+
+
 def test_odometry_and_trajectory_have_the_same_poses() -> None:
     world = cut_in_two(closing(two_laps(), lap_pairs(0, 15, 30, 45)))
     for graph, count in ((drive(world, closures=False), LAP), (drive(world), 2 * LAP)):

@@ -206,9 +206,9 @@ class PoseGraphNode(BaseNode):
         self._worker.submit(self._take, needed=True, once=True)
 
     def _take(self) -> None:
-        """Pass queued inputs to the graph, and go on deciding; the odometry's correction is that of its session."""
+        """Pass queued inputs to the graph, and decide once none waits; the odometry's correction is of its session."""
         batch = [self._inbox.popleft() for _ in range(min(len(self._inbox), AT_ONCE))]
-        verdicts, resets = self._durable.take([item for item, _ in batch], DECIDE_S)
+        verdicts, resets = self._durable.take([item for item, _ in batch], self._decide_s)
         for reset in resets:
             self.get_logger().warning(f"{reset.reason}: a new session begins")
         session = max([self._corrected, *(session for _, session in batch)])
@@ -218,6 +218,11 @@ class PoseGraphNode(BaseNode):
         self._announce(verdicts)
         if (self._inbox or self._is_behind) and not self._ending:
             self._worker.submit(self._take, needed=True, once=True)
+
+    @property
+    def _decide_s(self) -> float:
+        """Time to decide about closures: none while inputs wait, as the newest closures are decided about first."""
+        return 0.0 if self._inbox else DECIDE_S
 
     @property
     def _is_behind(self) -> bool:
@@ -269,7 +274,7 @@ class PoseGraphNode(BaseNode):
 
     def _update(self) -> None:
         """Decide about closures whose odometry has arrived, and publish the new path."""
-        self._announce(self._durable.update(not self._is_behind, DECIDE_S))
+        self._announce(self._durable.update(not self._is_behind, self._decide_s))
         self._tell_refusals()
         if not self._is_behind:
             self._durable.prepare(PREPARE_S)

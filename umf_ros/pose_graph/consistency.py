@@ -13,6 +13,7 @@ worse than stated: no single place decides about that.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,6 +51,8 @@ _LEAST_ODOMETRY = 0.3
 # nats below the likeliest factor that are still plausible
 _PLAUSIBLE = 2.0
 _AT_ONCE = 64
+# closures, the latest, whose loops are weighted again: enough for the noise of an axis, in a quarter of a second
+_MOST_WEIGHTED_AGAIN = 300
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,7 @@ def likelihood_ratio(false_alarms: Array, distances: Array, settings: PoseGraphS
 
 
 def loops_between(one: Closures, others: Closures) -> Loops:
-    """Return the loops (N,) of one closure (1,) with (N,) others, whose endpoints are pairwise in one session.
+    """Return the loops (N,) of a closure (1,), or of N, with (N,) others, whose endpoints are pairwise in one session.
 
     A loop leads from the match of one to its query, the query of the other, the match of the other, and back.
     """
@@ -117,10 +120,11 @@ def loops_between(one: Closures, others: Closures) -> Loops:
 
 
 def paths_between(one: Closures, other: Closures) -> Array:
-    """Return (2, N) path lengths in m between matches and between queries of closures; infinite between sessions."""
+    """Return (2, N) path lengths in m between matches and between queries of closures; infinite between their parts."""
     found = []
     for a, b in ((one["match"], other["match"]), (one["query"], other["query"])):
-        found.append(np.where(a["session"] == b["session"], np.abs(a["travel"] - b["travel"]), np.inf))
+        is_joined = (a["session"] == b["session"]) & (a["part"] == b["part"])
+        found.append(np.where(is_joined, np.abs(a["travel"] - b["travel"]), np.inf))
     return np.stack(found)
 
 
@@ -137,7 +141,12 @@ class ConsistencyGraph:
         self.settings = settings
         self.scale = NoiseScale()
         self._table = Table(closure=np.empty(0, CLOSURE))
-        self.compare_all(self.scale)
+        self.place_of: list[int] = []
+        # for each closure those it was compared with, and which of them are consistent with it or not
+        self._near: list[list[int]] = []
+        self._consistent: list[dict[int, float]] = []
+        self._inconsistent: list[set[int]] = []
+        self._stale: set[int] = set()
 
     @property
     def closures(self) -> Closures:
@@ -147,16 +156,27 @@ class ConsistencyGraph:
     def add(self, closure: Closures) -> Loops:
         """Add a closure (1,) and compare it with all near ones; return the loops it makes with them."""
         self._table.extend(closure=closure)
-        return self._compare(len(self._table) - 1)
+        row = len(self._table) - 1
+        near = np.flatnonzero(paths_between(self.closures[:row], closure).max(axis=0) <= self.settings.support_range_m)
+        near = near[-_MOST_COMPARED:]
+        places = np.unique([self.place_of[other] for other in near]).astype(int)
+        self.place_of.append(int(min(places[self._same_place(places, row)], default=row)))
+        loops = loops_between(closure, self.closures[near])
+        consistent, inconsistent = self._judge(near, loops)
+        self._near.append(near.tolist())
+        self._consistent.append(consistent)
+        self._inconsistent.append(inconsistent)
+        for other in near.tolist():
+            self._near[other].append(row)
+        for other, ratio in consistent.items():
+            self._consistent[other][row] = ratio
+        for other in inconsistent:
+            self._inconsistent[other].add(row)
+        return loops
 
     def compare_all(self, scale: NoiseScale) -> None:
-        """Compare all again, with another scale."""
-        self.scale = scale
-        self.place_of: list[int] = []
-        self._consistent: list[dict[int, float]] = []
-        self._inconsistent: list[set[int]] = []
-        for row in range(len(self._table)):
-            self._compare(row)
+        """Compare all again, with another scale: each once it is asked for, as there may be thousands."""
+        self.scale, self._stale = scale, set(range(len(self._table)))
 
     def consistency_set(self, row: int, members: NDArray[np.bool_]) -> tuple[list[int], float]:
         """Return the closures of `members` consistent with `row` and each other, and the evidence for them in nats.
@@ -164,8 +184,8 @@ class ConsistencyGraph:
         From place to place the evidence grows by the improbability that the next one is consistent with the nearest
         by chance.
         """
-        consistent = [other for other in self._consistent[row] if members[other]]
-        consistent.sort(key=lambda other: -sum(1 for third in consistent if third in self._consistent[other]))
+        consistent = [other for other in self._compared(row)[0] if members[other]]
+        consistent.sort(key=lambda other: -len(self._compared(other)[0].keys() & consistent))
         found = [row]
         for other in consistent:
             if not any(other in self._inconsistent[member] for member in found):
@@ -182,12 +202,12 @@ class ConsistencyGraph:
 
     def companions(self, row: int, members: NDArray[np.bool_]) -> list[int]:
         """Return closures out of `members` of the same place that are consistent with this one."""
-        others = [other for other in self._consistent[row] if members[other]]
+        others = [other for other in self._compared(row)[0] if members[other]]
         return [other for other, same in zip(others, self._same_place(others, row), strict=True) if same]
 
     def opponents(self, row: int, members: NDArray[np.bool_]) -> list[int]:
         """Return closures out of `members` that are inconsistent with this one."""
-        return [other for other in self._inconsistent[row] if members[other]]
+        return [other for other in self._compared(row)[1] if members[other]]
 
     def count_places(self, rows: list[int]) -> int:
         """Return the number of places of closures."""
@@ -196,28 +216,26 @@ class ConsistencyGraph:
             rows, count = self._other_places(rows, rows[0]), count + 1
         return count
 
-    def _compare(self, row: int) -> Loops:
-        one = self.closures[row : row + 1]
-        near = np.flatnonzero(paths_between(self.closures[:row], one).max(axis=0) <= self.settings.support_range_m)
-        near = near[-_MOST_COMPARED:]
-        places = np.unique([self.place_of[other] for other in near]).astype(int)
-        self.place_of.append(int(min(places[self._same_place(places, row)], default=row)))
-        self._consistent.append({})
-        self._inconsistent.append(set())
-        loops = loops_between(one, self.closures[near])
+    def _compared(self, row: int) -> tuple[dict[int, float], set[int]]:
+        """Return likelihood ratios of the closures consistent with this one, and the inconsistent ones."""
+        if row in self._stale:
+            self._stale.remove(row)
+            others = np.array(self._near[row], np.int64)
+            later, earlier = np.maximum(others, row), np.minimum(others, row)
+            loops = loops_between(self.closures[later], self.closures[earlier])
+            self._consistent[row], self._inconsistent[row] = self._judge(others, loops)
+        return self._consistent[row], self._inconsistent[row]
+
+    def _judge(self, others: Rows, loops: Loops) -> tuple[dict[int, float], set[int]]:
+        """Return which others are consistent by the loops (N,) with them, with likelihood ratios, and which are not."""
         covariances = self.scale.covariances(loops["odometry"], loops["closures"]) + loops["drift"]
         distances = squared_mahalanobis(loops["residual"], covariances)
         false_alarms = false_alarm_ratio(covariances, self.settings)
         ratios = np.minimum(likelihood_ratio(false_alarms, distances, self.settings), 1.0)
-        for other, distance, false_alarm, ratio in zip(near.tolist(), distances, false_alarms, ratios, strict=True):
-            if false_alarm >= 1:  # any closure would pass
-                continue
-            if distance <= self.settings.pair_chi2:
-                self._consistent[row][other] = self._consistent[other][row] = float(ratio)
-            else:
-                self._inconsistent[row].add(other)
-                self._inconsistent[other].add(row)
-        return loops
+        is_known = false_alarms < 1  # else any closure would pass
+        is_near = distances <= self.settings.pair_chi2
+        consistent = dict(zip(others[is_known & is_near].tolist(), ratios[is_known & is_near].tolist(), strict=True))
+        return consistent, set(others[is_known & ~is_near].tolist())
 
     def _same_place(self, rows: Sequence[int] | Rows, other: int) -> NDArray[np.bool_]:
         """Return (N,) whether closures are of the same place as another one."""
@@ -241,7 +259,7 @@ class NoiseScaleEstimator:
         # one decade off is two sigmas: a few loops cannot move a stated covariance
         self._likelihood = -0.5 * ((logs[:, None] / 1.15) ** 2 + (logs[None, :] / 1.15) ** 2)
         self._prior = self._of_axis = np.stack([self._likelihood] * _DEGREES)
-        self._spread: list[Loops] = []
+        self._spread: deque[Loops] = deque(maxlen=_MOST_WEIGHTED_AGAIN)
         self._factors = len(logs) // 2, len(logs) // 2  # with which loops are weighted
         self._of_place: dict[int, Array] = {}
         self.loops = 0
@@ -259,7 +277,7 @@ class NoiseScaleEstimator:
         self._likelihood = self._likelihood + new
         self.loops += len(latest)
         # a loop counts for single axes as far as all together take it for right, by the stated noise at least: the
-        # first loops may all be wrong, so that all are weighted again when the likeliest factors change
+        # first loops may all be wrong, so that the latest are weighted again when the likeliest factors change
         odometry, closures = divmod(int(np.argmax(self._likelihood)), len(_GRID))
         factors = max(odometry, len(_GRID) // 2), closures
         self._spread.append(spread)

@@ -22,6 +22,7 @@ from umf_ros.core.geometry import (
 from umf_ros.core.odometry_noise import OdometryNoise
 from umf_ros.core.table import Table
 from umf_ros.core.trajectory import bracket, interpolated
+from umf_ros.sensors.sessions import ANY_SPEED, LONGEST_SILENCE_S, SILENCE_NS, USUAL_GAPS
 
 Stamps = NDArray[np.int64]
 Rows = NDArray[np.int64]
@@ -29,6 +30,7 @@ PathPoints = NDArray[np.void]
 POINT = np.dtype(
     [
         ("session", "i8"),
+        ("part", "i8"),
         ("stamp", "i8"),
         ("travel", "f8"),
         ("pose", "f8", (4, 4)),
@@ -36,9 +38,10 @@ POINT = np.dtype(
         ("drift", "f8", (6, 2)),
     ]
 )
-"""Fields of `PathPoints`, the odometry at some stamps: session, stamp in ns, path length in m since its start, pose,
-the noise of all steps so far, and the twist of a constant error of heading (rad/m) and of scale. Pose, noise and drift
-are seen from the session's first position, so that sums stay well conditioned."""
+"""Fields of `PathPoints`, the odometry at some stamps: session, number of silences beyond `max_gap_s` so far, stamp in
+ns, path length in m since its start, pose, the noise of all steps so far, and the twist of a constant error of heading
+(rad/m) and of scale. Pose, noise and drift are seen from the session's first position, so that sums stay well
+conditioned."""
 # by hand: standard deviations of the constant errors of a rover's odometry, which no covariance states: heading, rad/m,
 # and scale (wheels that slip in sand, a track width or a stereo baseline that is wrong)
 _DRIFT_SIGMAS = np.array([np.deg2rad(0.2), 0.03])
@@ -46,6 +49,8 @@ _DRIFT_SIGMAS = np.array([np.deg2rad(0.2), 0.03])
 # m/s^2) during it, and this (rad, m)
 _JUMP, _ACCELERATION = np.array([np.deg2rad(5.0), 0.3]), np.array([np.deg2rad(300.0), 5.0])
 _STEPS_BEFORE = 9
+# by hand: silence, s, after which a rover may have moved at its recent speed, or at any rover's, all the time
+_FREE_S = 2.0
 
 
 def noise_between(a: PathPoints, b: PathPoints) -> Array:
@@ -71,7 +76,9 @@ class OdometryChain:
     The noise of the path from a to b is a difference of prefix sums: with `W` the covariance of a
     step carried to the origin by the adjoint, `cov(a_T_b) = Ad(b)^-1 (sum_b W - sum_a W) Ad(b)^-T`
     in the tangent space of b. So any two stamps of a session are compared in constant time. The same holds for the
-    twist of constant errors. A step that jumps, as where a filter took a GNSS fix, is as uncertain as it is too long.
+    twist of constant errors. A step that jumps, as where a filter took a GNSS fix, is as uncertain as it is too long. A
+    step over a silence is as uncertain as the motion that the recent speed allows: where the odometry restarted or
+    jumped meanwhile, closures correct it.
     """
 
     def __init__(self, settings: PoseGraphSettings, session: int = 0) -> None:
@@ -82,7 +89,12 @@ class OdometryChain:
         stamps, poses = np.empty(0, np.int64), np.empty((0, 4, 4))
         self._messages = Table(stamp=stamps, pose=poses)
         self._keyframes = Table(
-            stamp=stamps, pose=poses, travel=np.empty(0), noise=np.empty((0, 6, 6)), drift=np.empty((0, 6, 2))
+            stamp=stamps,
+            part=stamps,
+            pose=poses,
+            travel=np.empty(0),
+            noise=np.empty((0, 6, 6)),
+            drift=np.empty((0, 6, 2)),
         )
 
     @property
@@ -143,6 +155,7 @@ class OdometryChain:
         lower, upper, share = bracket(self.stamps, stamps)
         points = np.zeros(len(stamps), POINT)
         points["session"], points["stamp"], points["pose"] = self._session, stamps, self._from_origin(poses)
+        points["part"] = self._keyframes["part"][lower]
         points["travel"] = (1 - share) * travel[lower] + share * travel[upper]
         shares = share[:, None, None]
         for name in ("noise", "drift"):
@@ -188,45 +201,55 @@ class OdometryChain:
         start = int(np.searchsorted(self._messages["stamp"], self.stamps[-1])) if known else 0
         messages = self._messages["stamp"][start:]
         given, cells = self._has_covariance(messages), messages // period
+        loose = self._loose_steps(start)
+        is_loose = np.any(loose > 0, axis=1)
+        ends = is_loose | np.append(is_loose[1:], False)
         # the first row is the last keyframe that is known
-        rows = np.flatnonzero(given | (np.diff(cells, prepend=cells[0] - 1) > 0))
+        rows = np.flatnonzero(given | ends | (np.diff(cells, prepend=cells[0] - 1) > 0))
         stamps, poses = messages[rows], self._messages["pose"][start + rows]
         steps = self._noise.path_lengths(poses[:-1], poses[1:], np.diff(stamps) / 1e9)
         travel = np.cumsum([0.0, *steps]) + (self._keyframes["travel"][-1] if known else 0.0)
-        keep = given[rows] | (np.diff(np.floor(travel / self._settings.keyframe_spacing_m), prepend=-1) > 0)
+        keep = (given | ends)[rows] | (np.diff(np.floor(travel / self._settings.keyframe_spacing_m), prepend=-1) > 0)
         keep[0] = not known
         if keep.any():
-            jumped = np.cumsum(self._find_jumps(start) ** 2, axis=0)[np.concatenate([rows[:1], rows[keep]])]
-            self._add_keyframes(
-                stamps[keep], np.concatenate([poses[:1], poses[keep]]), travel[keep], travel[0], np.diff(jumped, axis=0)
-            )
+            added = np.diff(np.cumsum(loose**2, axis=0)[np.concatenate([rows[:1], rows[keep]])], axis=0)
+            is_parted = is_loose & (np.diff(messages, prepend=messages[0]) > self._settings.max_gap_s * 1e9)
+            parts = np.cumsum(is_parted)[rows[keep]] + (self._keyframes["part"][-1] if known else 0)
+            kept_poses = np.concatenate([poses[:1], poses[keep]])
+            self._add_keyframes(stamps[keep], parts, kept_poses, travel[keep], travel[0], added)
 
-    def _find_jumps(self, start: int) -> Array:
-        """Return (M, 2) excess, rad and m, of the steps that jump and end at messages after `start`; 0 for others.
+    def _loose_steps(self, start: int) -> Array:
+        """Return (M, 2) additional standard deviations, rad and m, of the steps that end at messages after `start`.
 
-        The speed of a step is compared with the median of those before, so that later messages do not change it.
+        They are 0 but for steps that jump or span a silence. The speed and the period of a step are compared with the
+        medians of those before, so that later messages do not change it.
         """
         first = max(start - _STEPS_BEFORE, 0)
         stamps, poses = self._messages["stamp"][first:], self._messages["pose"][first:]
-        excess = np.zeros((len(stamps), 2))
+        sigmas = np.zeros((len(stamps), 2))
         if len(stamps) > _STEPS_BEFORE + 1:
-            seconds = np.diff(stamps)[:, None] / 1e9
+            periods = np.diff(stamps)[:, None] / 1e9
             lengths = np.linalg.norm(logmap(invert(poses[:-1]) @ poses[1:]).reshape(-1, 2, 3), axis=2)
-            before = sliding_window_view((lengths / seconds)[:-1], _STEPS_BEFORE, axis=0)
-            usual = np.median(before, axis=2) * seconds[_STEPS_BEFORE:]
-            too_long = lengths[_STEPS_BEFORE:] - usual
-            limits = _JUMP + usual + _ACCELERATION * seconds[_STEPS_BEFORE:] ** 2
-            excess[_STEPS_BEFORE + 1 :] = np.where(too_long > limits, too_long, 0.0)
-        excess[: start - first + 1] = 0.0  # known before
-        return excess[start - first :]
+            before = sliding_window_view(np.hstack([lengths / periods, periods])[:-1], _STEPS_BEFORE, axis=0)
+            usual, seconds = np.median(before, axis=2), periods[_STEPS_BEFORE:]
+            too_long = lengths[_STEPS_BEFORE:] - usual[:, :2] * seconds
+            limits = _JUMP + usual[:, :2] * seconds + _ACCELERATION * seconds**2
+            free_s = np.minimum(seconds, LONGEST_SILENCE_S)
+            unseen = np.maximum(usual[:, :2], ANY_SPEED[::-1]) * free_s * np.minimum(free_s / _FREE_S, 1.0)
+            unseen[seconds[:, 0] <= np.maximum(SILENCE_NS / 1e9, USUAL_GAPS * usual[:, 2])] = 0.0
+            sigmas[_STEPS_BEFORE + 1 :] = np.where(too_long > limits, too_long, np.minimum(unseen, [np.pi, np.inf]))
+        sigmas[: start - first + 1] = 0.0  # known before
+        return sigmas[start - first :]
 
-    def _add_keyframes(self, stamps: Stamps, poses: Array, travel: Array, start: float, jumped: Array) -> None:
-        """Add N keyframes after `poses[0]`, up to which the path length is `start`; (N, 2) `jumped`, rad^2 and m^2."""
+    def _add_keyframes(
+        self, stamps: Stamps, parts: Rows, poses: Array, travel: Array, start: float, added: Array
+    ) -> None:
+        """Add N keyframes after `poses[0]`, up to which the path length is `start`; `added` noise, rad^2 and m^2."""
         steps = self._noise.covariances(np.diff(travel, prepend=start))
         moved = invert(poses[:-1]) @ poses[1:]
         for row in np.flatnonzero(self._has_covariance(stamps)):
             steps[row] = ros_to_gtsam_covariance(self._covariances[int(stamps[row])], moved[row])
-        steps += np.repeat(jumped, 3, axis=1)[:, :, None] * np.eye(6)
+        steps += np.repeat(added, 3, axis=1)[:, :, None] * np.eye(6)
         twists = np.zeros((len(steps), 6, 2))
         twists[:, 2, 0] = np.linalg.norm(moved[:, :3, 3], axis=1)
         twists[:, 3:, 1] = (np.swapaxes(moved[:, :3, :3], 1, 2) @ moved[:, :3, 3:])[..., 0]
@@ -234,7 +257,7 @@ class OdometryChain:
         sums = {"noise": propagate(carry, steps), "drift": carry @ twists}
         for name, one in sums.items():
             sums[name] = np.cumsum(one, axis=0) + (self._keyframes[name][-1] if len(self._keyframes) else 0.0)
-        self._keyframes.extend(stamp=stamps, pose=poses[1:], travel=travel, **sums)
+        self._keyframes.extend(stamp=stamps, part=parts, pose=poses[1:], travel=travel, **sums)
 
     def _has_covariance(self, stamps: Stamps) -> NDArray[np.bool_]:
         return np.fromiter((stamp in self._covariances for stamp in stamps.tolist()), bool, len(stamps))

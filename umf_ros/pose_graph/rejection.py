@@ -13,6 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError
@@ -34,12 +36,15 @@ from umf_ros.pose_graph.consistency import (
     likelihood_ratio,
     squared_mahalanobis,
 )
+from umf_ros.pose_graph.odometry import Rows
 from umf_ros.pose_graph.sessions import RelativeCovariances, Sessions
 
 _LOOPS_PER_CLOSURE = 3
 _MOST_ROUNDS = 4
 # a rejected closure further than this from the moved map (m) is not compared again
 _CLOSE_M = 2.0
+# closures that are compared again, or accepted as unopposed, in one step: its cost does not grow with those that wait
+_MOST_WAITING = 100
 # largest odds against a closure without support: during the drive, and at the end; .1 during the drive accepts a group
 # of aliases in 2 of 42 cells of `pose_graph.py` with seed 25501, .03 none, and both accept all right closures
 _MOST_ODDS, _MOST_ODDS_AT_LAST = 0.03, 0.2
@@ -76,8 +81,8 @@ class OutlierRejection:
         self._map: RelativeCovariances | None = None
         self._is_rough = self._is_outdated = False  # outdated: without some accepted closures that agree with it
         self._ratios: list[float] = []  # likelihood of how closures fit the map if wrong over that if right
-        self._joined: list[bool] = []  # whether the map joins both endpoints
-        self._near_map: list[int] = []
+        self._joined: list[bool] = []  # whether the map joins both endpoints, by more than odometry across a silence
+        self._again: set[int] = set()  # closures to compare again with the moved map
 
     @property
     def scale(self) -> NoiseScale:
@@ -111,7 +116,7 @@ class OutlierRejection:
         """Add closures; return the verdicts that are new or changed.
 
         The map is solved twice at most, roughly, and not at all if every closure agrees with it. Closures near the
-        moved map are compared by the next call.
+        moved map are compared by the next calls, the newest first: the cost does not grow with their number.
         """
         before = list(self.verdicts)
         rows = [self._take(placed) for placed in arrived]
@@ -120,8 +125,8 @@ class OutlierRejection:
         widened = self._map is not None and self._estimator.widest > self._map.widest
         if self._rescale() or unsolved or widened or (rows and begun):
             self.solve(rough=True)
-            rows = list(range(len(self.placed)))
-        self._decide({*rows, *self._near_map})
+            self._again = set(range(len(self.placed)))
+        self._decide({*rows, *sorted(self._again)[-_MOST_WAITING:]})
         return self._changed_since(before)
 
     def refine(self) -> None:
@@ -190,7 +195,7 @@ class OutlierRejection:
                 return
             if self._is_outdated:
                 self.solve(rough=True)
-            rows = self._near_map
+            rows = set(self._again)
 
     def _decide(self, rows: Iterable[int]) -> bool:
         """Decide about closures and solve the map with the accepted ones; return false without any.
@@ -198,7 +203,8 @@ class OutlierRejection:
         Closures that agree with the map leave it as it is: its bounds hold without them, only wider. It is solved with
         them once another closure does not agree with it, or contradicts one of them.
         """
-        rows, self._near_map = sorted(rows), []
+        rows = sorted(rows)
+        self._again.difference_update(rows)
         agreed, accepted = self._gate(rows), self._of(State.ACCEPTED)
         opposed = any(self._consistency.opponents(row, accepted) for row in agreed)
         if self._is_outdated and (opposed or len(agreed) < (~accepted & ~self._revoked)[rows].sum()):
@@ -264,9 +270,9 @@ class OutlierRejection:
         agree with the estimated one, the less likely is the other.
 
         Returns:
-            (N,) squared Mahalanobis distances, misfits in metres, whether the map joins the endpoints, likelihoods of
-            this distance for a wrong closure over that for a right one, false-alarm probabilities, and squared
-            Mahalanobis distances by the widest plausible noise.
+            (N,) squared Mahalanobis distances, misfits in metres, whether the map joins the endpoints by more than
+            odometry across a silence, likelihoods of this distance for a wrong closure over that for a right one,
+            false-alarm probabilities, and squared Mahalanobis distances by the widest plausible noise.
         """
         assert self._map is not None
         chosen = self.closures[rows]
@@ -283,7 +289,19 @@ class OutlierRejection:
         agreed = {self._consistency.place_of[row] for row in np.flatnonzero(self._of(ClosureReason.AGREES))}
         unlikely = likelihood_ratio((2 + len(agreed)) * too_wide, wide[joined], self.settings)
         ratios[joined] = np.where(distances[joined] > self.settings.gate_chi2, unlikely, np.minimum(usual, unlikely))
-        return distances, metres, joined, ratios, false_alarms, wide
+        return distances, metres, joined & self._join_parts(rows), ratios, false_alarms, wide
+
+    def _join_parts(self, rows: Rows) -> NDArray[np.bool_]:
+        """Return (N,) whether accepted closures, or odometry without a silence, join the endpoints of closures."""
+        accepted = np.flatnonzero(self._of(State.ACCEPTED))
+        chosen = [self.closures[end][np.concatenate([accepted, rows])] for end in ("match", "query")]
+        ends = np.concatenate([np.stack([end["session"], end["part"]], axis=1) for end in chosen])
+        parts, of = np.unique(ends, axis=0, return_inverse=True)
+        match, query = of.reshape(2, -1)
+        links = match[: len(accepted)], query[: len(accepted)]
+        joins = csr_matrix((np.ones(len(accepted)), links), shape=(len(parts), len(parts)))
+        labels = connected_components(joins, directed=False)[1]
+        return np.asarray(labels[match[len(accepted) :]] == labels[query[len(accepted) :]])
 
     def _misfits(self, rows: NDArray[np.int64]) -> Array:
         """Return (N, 4, 4) residual poses: queries of closures by the map, relative to their poses by the closures."""
@@ -352,6 +370,7 @@ class OutlierRejection:
             queries = self.closures["query"]
             waited_m = queries["travel"][-1] - queries["travel"]
             waiting &= (queries["session"] != queries["session"][-1]) | (waited_m >= self.settings.patience_m)
+            waiting[np.flatnonzero(waiting)[:-_MOST_WAITING]] = False
         companions = ~self._of(State.ACCEPTED) & ~self._revoked
         places = [[row, *self._consistency.companions(row, companions)] for row in np.flatnonzero(waiting).tolist()]
         self._gate(sorted({member for place in places for member in place}))
@@ -381,7 +400,9 @@ class OutlierRejection:
         prior = (_COUNTED * (1 - right) + rejected) / (_COUNTED * right + accepted)
         odds = odds * np.exp(-self._consistency.consistency_set(place[0], self._of(State.PENDING))[1])
         if not self._joined[place[0]]:
-            return odds * max(prior, 1 / _USUALLY_RIGHT - 1) * _WRONG_BETWEEN
+            placed = self.placed[place[0]]
+            least = 0.0 if placed.match == placed.query else 1 / _USUALLY_RIGHT - 1
+            return odds * max(prior, least) * _WRONG_BETWEEN
         # of those that contradict the estimated noise most are wrong, and single ones too
         is_usual = self.verdicts[place[0]].residual ** 2 <= self.settings.gate_chi2
         return odds * prior * (_WRONG_ALONE if len(place) == 1 and is_usual else 1.0)
@@ -413,7 +434,7 @@ class OutlierRejection:
         self._is_rough, self._is_outdated = rough, False
         self._map = RelativeCovariances(self._sessions, self._estimator.widest)
         rows = np.flatnonzero(~self._of(State.ACCEPTED) & ~self._revoked)
-        self._near_map = rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist()
+        self._again.update(rows[np.linalg.norm(self._misfits(rows)[:, :3, 3], axis=1) < _CLOSE_M].tolist())
 
     def _reject(self, row: int, reason: ClosureReason) -> None:
         self.verdicts[row] = ClosureVerdict(self.placed[row].closure, State.REJECTED, reason)

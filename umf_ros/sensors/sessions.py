@@ -31,6 +31,10 @@ AHEAD_NS = 500_000_000
 """Shortest gap after which the next stamp may be ahead of time."""
 FASTEST_M_PER_S, FASTEST_RAD_PER_S = 20.0, 6.0
 LEAST_JUMP_M, LEAST_JUMP_RAD = 2.0, 0.7
+ANY_SPEED = np.array([1.0, 0.3])
+"""Speeds that any rover may have, m/s and rad/s."""
+LONGEST_SILENCE_S = 60.0
+"""A longer silence explains no more motion."""
 DROPPED = ("clock jump", "position jump")
 """Faults of messages that were held and then dropped."""
 
@@ -251,18 +255,14 @@ def _excess(moved: tuple[float, float], most: tuple[float, float]) -> str:
 class OdometryMotion:
     """Motion of the odometry of one session: its first pose, its last second, and its highest speeds."""
 
-    _SPEEDS = np.array([1.0, 0.3])
-    """Speeds that any rover may have, m/s and rad/s."""
     _SLACK = np.array([1.0, 0.3])
     """Motion during a silence beyond that at the highest speeds so far, m and rad."""
-    _LONGEST_S = 60.0
-    """A longer silence explains no more motion."""
     _MARGIN = 1.25
 
     def __init__(self) -> None:
         self._starts: list[Array] = []
         self._recent: deque[tuple[int, Array]] = deque()
-        self._highest = self._SPEEDS
+        self._highest = ANY_SPEED
 
     def add(self, stamp_ns: int, odom_T_body: Array) -> None:
         """Add the next message, a (4, 4) pose."""
@@ -282,7 +282,7 @@ class OdometryMotion:
         that starts again is always silent, and lies at its origin, or at its first pose, afterwards.
         """
         last = self._recent[-1][1]
-        elapsed_s = min(abs(elapsed_ns) * 1e-9, self._LONGEST_S)
+        elapsed_s = min(abs(elapsed_ns) * 1e-9, LONGEST_SILENCE_S)
         moved = np.array(_apart(last, odom_T_body))
         if not after_silence or self._seconds < 0.4:
             reason = _jump(last, odom_T_body, elapsed_ns)
