@@ -5,12 +5,15 @@ from __future__ import annotations
 import bz2
 import gzip
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from dialect_case import Case, Check, Outcome, says
+from dialects_recordings import case as recorded
+from dialects_recordings import changed
 from dialects_sensors import (
     CLOUD,
     LEFT,
@@ -115,15 +118,6 @@ def restamped(seconds: float, relative: bool = True) -> Callable[[Any], None]:
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(moved_ns, 10**9)
 
     return alter
-
-
-def logged(after: Callable[[int], int]) -> Change:
-    """Recorded some ns after the stamp in the header."""
-
-    def change(topic: str, message: Any) -> Iterator[tuple[int, Any]]:
-        yield 0 if topic == STATIC else after(stamp_of(message)), message
-
-    return change
 
 
 def mounted(move: Callable[[Array], Array], names: tuple[str, ...] = ("lidar",)) -> Change:
@@ -245,12 +239,12 @@ def _told(name: str, change: Change, text: str) -> Case:
 DOWN, OPTICAL = np.diag([1.0, -1, -1]), np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 MOUNTING = "LiDAR's mounting is off"
 ALONE = "the left camera is used alone"
-EPOCH_S = 1.6256448e9
+EPOCH_NS = 1_625_644_800_000_000_000
 CASES = [
     _withheld("01 LiDAR backwards", points(_about("z", 180)), MOUNTING),
     _withheld("01 LiDAR pitched by 30 deg", points(_about("y", 30)), MOUNTING),
     _withheld("01 LiDAR left-handed in x", points(np.diag([-1.0, 1, 1])), "left-handed"),
-    _withheld("01 points in millimetres", points(1000 * np.eye(3)), "millimetres"),
+    _told("01 points in millimetres", points(1000 * np.eye(3)), "points have to be in metres"),
     _withheld("01 mounting inverted", mounted(invert), MOUNTING),
     _told("01 camera mounting inverted", mounted(invert, ("camera", "left_camera")), "camera's mounting is off"),
     _withheld("01 odometry w first", poses(lambda pose, _: pose, w_first=True), "odometry"),
@@ -261,8 +255,9 @@ CASES = [
     _right("03 s_of_day_f8", timed("timestamp", "<f8", lambda o, s: (s % (86400 * 10**9) + o) * 1e-9)),
     _right("03 end_s_f4", timed("time", "<f4", lambda offsets, stamp: (offsets - offsets.max()) * 1e-9)),
     _right("03 us_i4", timed("offset_time", "<i4", lambda offsets, stamp: offsets // 1000)),
-    _right("05 logged at once", logged(lambda stamp_ns: round(EPOCH_S * 1e9) - stamp_ns)),
-    _right("05 logged at double speed", logged(lambda stamp_ns: (stamp_ns - round(EPOCH_S * 1e9)) // -2)),
+    recorded("n05 logged at once", changed(lambda raw: [replace(raw, log_ns=EPOCH_NS)])),
+    recorded("n05 logged at half speed", changed(lambda raw: [replace(raw, log_ns=2 * raw.log_ns - EPOCH_NS)])),
+    recorded("n05 logged in 1970", changed(lambda raw: [replace(raw, log_ns=raw.log_ns - EPOCH_NS)])),
     _right("05 scan of stamp 0", altered((CLOUD,), restamped(0, relative=False), slice(60, 61))),
     _right("05 odometry of stamp 0", altered((ODOMETRY,), restamped(0, relative=False), slice(60, 61))),
     _right("05 first odometry of stamp 0", altered((ODOMETRY,), restamped(0, relative=False), slice(0, 1))),

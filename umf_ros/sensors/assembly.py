@@ -126,6 +126,9 @@ MOST = 0.8
 """A limit that would drop more than this share of all returns so far was written for another sensor (*by hand*: the
 Cube-1's drops a quarter of a scan at most, one written for 0 to 4095 drops all of 0 to 1)."""
 
+FARTHEST_M = 500.0
+"""Median range beyond that of any LiDAR (*by hand*): points in centimetres or millimetres."""
+
 
 class ScanLimits:
     """Filter of weak returns and of returns far above or below the LiDAR.
@@ -159,6 +162,10 @@ class ScanLimits:
             hint = f"intensities reach {self._strongest:.3g}"
             # drivers send 0 where there is no intensity: not counted
             keep = keep & self._limited(f"min_intensity {self._min_intensity:g}", strong, cloud.intensity > 0, hint)
+        range_m = float(np.median(np.linalg.norm(cloud.points, axis=1))) if len(cloud.points) else 0.0
+        if range_m > FARTHEST_M:
+            where = f"half of a scan's returns are beyond {range_m:.0f} m"
+            self._warn_once("units", f"{where}: points have to be in metres (REP 103); such scans give no closures")
         if not keep.any():
             self._warn_once("empty", f"a scan of {len(keep)} returns, none of them usable; such scans are skipped")
         return Cloud(
