@@ -290,6 +290,8 @@ CASES = [
     _right("14 jump of 0.5 m", jump(0.5, 0, (600,))),
     _right("14 jump of 1.9 m", jump(1.9, 0, (600,))),
     _right("14 jump of 20 deg", jump(0, 20, (600,))),
+    _right("14 jump of 1 m during a scan of a match", jump(1, 0, (135,))),
+    _right("14 jump of 8 deg during a scan of a match", jump(0, 8, (135,))),
     _right("14 two jumps of 1 m", jump(1, 0, (400, 700))),
     _told("20 left image late", delayed((LEFT,), 1), "images"),
     _told("20 right image two frames late", delayed((RIGHT,), 2), "images"),

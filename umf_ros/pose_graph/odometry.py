@@ -19,7 +19,7 @@ from umf_ros.core.geometry import (
     propagate,
     ros_to_gtsam_covariance,
 )
-from umf_ros.core.odometry_noise import OdometryNoise
+from umf_ros.core.odometry_noise import STEPS_BEFORE, OdometryNoise, jump_excess
 from umf_ros.core.table import Table
 from umf_ros.core.trajectory import bracket, interpolated
 
@@ -42,10 +42,6 @@ are seen from the session's first position, so that sums stay well conditioned."
 # by hand: standard deviations of the constant errors of a rover's odometry, which no covariance states: heading, rad/m,
 # and scale (wheels that slip in sand, a track width or a stereo baseline that is wrong)
 _DRIFT_SIGMAS = np.array([np.deg2rad(0.2), 0.03])
-# by hand: a step is a jump if it exceeds the speed of the steps before by as much again, an acceleration (rad/s^2,
-# m/s^2) during it, and this (rad, m)
-_JUMP, _ACCELERATION = np.array([np.deg2rad(5.0), 0.3]), np.array([np.deg2rad(300.0), 5.0])
-_STEPS_BEFORE = 9
 
 
 def noise_between(a: PathPoints, b: PathPoints) -> Array:
@@ -206,17 +202,14 @@ class OdometryChain:
 
         The speed of a step is compared with the median of those before, so that later messages do not change it.
         """
-        first = max(start - _STEPS_BEFORE, 0)
+        first = max(start - STEPS_BEFORE, 0)
         stamps, poses = self._messages["stamp"][first:], self._messages["pose"][first:]
         excess = np.zeros((len(stamps), 2))
-        if len(stamps) > _STEPS_BEFORE + 1:
-            seconds = np.diff(stamps)[:, None] / 1e9
+        if len(stamps) > STEPS_BEFORE + 1:
+            seconds = np.diff(stamps) / 1e9
             lengths = np.linalg.norm(logmap(invert(poses[:-1]) @ poses[1:]).reshape(-1, 2, 3), axis=2)
-            before = sliding_window_view((lengths / seconds)[:-1], _STEPS_BEFORE, axis=0)
-            usual = np.median(before, axis=2) * seconds[_STEPS_BEFORE:]
-            too_long = lengths[_STEPS_BEFORE:] - usual
-            limits = _JUMP + usual + _ACCELERATION * seconds[_STEPS_BEFORE:] ** 2
-            excess[_STEPS_BEFORE + 1 :] = np.where(too_long > limits, too_long, 0.0)
+            before = sliding_window_view((lengths / seconds[:, None])[:-1], STEPS_BEFORE, axis=0)
+            excess[STEPS_BEFORE + 1 :] = jump_excess(lengths[STEPS_BEFORE:], seconds[STEPS_BEFORE:], before)
         excess[: start - first + 1] = 0.0  # known before
         return excess[start - first :]
 
