@@ -230,13 +230,13 @@ def plain() -> int:
         return int(case.run(Path(folder))[1])
 
 
-def closures(text: str = "") -> Check:
-    """Return a check of the true closures, of which a tenth may lie at the limit, the false ones, and of a line."""
+def closures(text: str = "", least: float = 0.9) -> Check:
+    """Return a check of the true closures, at least a share of those of the drive, the false ones, and of a line."""
 
     def check(outcome: Outcome) -> tuple[bool, str]:
         (true, false), expected = judged(outcome), plain()
         told, line = says(text)(outcome) if text else (True, "")
-        return true >= 0.9 * expected > 0 == false and told, f"{true} of {expected}, {false} false; {line}"
+        return true >= least * expected > 0 == false and told, f"{true} of {expected}, {false} false; {line}"
 
     return check
 
