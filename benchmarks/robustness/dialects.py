@@ -18,11 +18,14 @@ from typing import Annotated
 import typer
 from dialect_case import Case
 from dialects_graphs import CASES as GRAPHS
+from dialects_neighbours import CASES as NEIGHBOURS
+from dialects_recordings import CASES as RECORDINGS
+from dialects_sensors import CASES as SENSORS
 from dialects_trajectories import CASES as TRAJECTORIES
 from rich.console import Console
 from rich.markup import escape
 
-CASES: list[Case] = [*GRAPHS, *TRAJECTORIES]
+CASES: list[Case] = [*GRAPHS, *TRAJECTORIES, *RECORDINGS, *SENSORS, *NEIGHBOURS]
 
 
 def main(

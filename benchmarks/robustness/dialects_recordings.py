@@ -223,7 +223,7 @@ def closes(least: float = 0.9) -> Check:
     return check
 
 
-RIGHT = 12
+RIGHT = 28
 """Right closures of the drive as it is, by `umf replay`."""
 
 

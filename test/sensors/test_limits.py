@@ -86,6 +86,19 @@ def test_a_height_limit_along_another_axis_is_not_applied() -> None:
     assert "max_height_m 7" in line and "z axis" in line
 
 
+@pytest.mark.parametrize("units", [100, 1000])
+def test_points_in_other_units_are_told_once(units: int) -> None:
+    told: list[str] = []
+    metres, filtered = scan(), limits(told)
+    for _ in range(3):
+        filtered.apply(Cloud(metres.points * np.array([1, 1, 0], np.float32) + np.array([8, 0, 0], np.float32)))
+    assert not told
+    for _ in range(3):
+        filtered.apply(Cloud((metres.points + np.array([8, 0, 0], np.float32)) * np.float32(units)))
+    (line,) = told
+    assert "in metres" in line
+
+
 def test_limits_are_off_where_the_calibration_has_none(tmp_path) -> None:
     path = tmp_path / "calibration.yaml"
     without = "".join(line for line in CALIBRATION.splitlines(keepends=True) if not line.startswith(("min_", "max_")))

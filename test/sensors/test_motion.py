@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from recordings import drive
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.geometry import Array, invert, make_pose, transform
+from umf_ros.core.geometry import Array, invert, make_pose, relative, transform
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.sensors.assembly import OdometryBuffer, deskew
+from umf_ros.sensors.assembly import OdometryBuffer, deskew, odometry_noise
 
 START_NS = 1_625_680_800_000_000_000
 S = 10**9
@@ -16,6 +17,10 @@ S = 10**9
 
 def ns(second: float) -> int:
     return START_NS + round(second * S)
+
+
+def turned(degrees: float) -> Array:
+    return np.asarray(Rotation.from_euler("z", degrees, degrees=True).as_matrix())
 
 
 def filled(seconds: Array, length_s: float = 10.0, max_gap_s: float = 1.0) -> OdometryBuffer:
@@ -34,6 +39,23 @@ def test_poses_are_those_of_the_drive_also_between_the_samples() -> None:
         np.testing.assert_allclose(found[:3, 3], drive(second)[:3, 3], atol=5e-4)
     sample = buffer.at(ns(0.3))
     assert sample is not None and np.array_equal(sample, drive(0.1 * 3))
+
+
+@pytest.mark.parametrize("jump", [make_pose(np.eye(3), [0, 1, 0]), make_pose(turned(12), [0, 0, 0])])
+def test_paths_go_on_across_a_jump(jump: Array) -> None:
+    buffer, seconds = OdometryBuffer(10.0, 1.0), np.arange(0, 4, 0.02)
+    for second in seconds:
+        buffer.add(ns(second), jump @ drive(second) if second > 2 else drive(second))
+    for second in (1.9, 2.1, 3.9):
+        found = buffer.at(ns(second))
+        assert found is not None and np.allclose(
+            found, jump @ drive(second) if second > 2 else drive(second), atol=2e-3
+        )
+    path = buffer.path(ns(1.9), ns(2.1)).poses
+    np.testing.assert_allclose(relative(path[0], path[-1]), relative(drive(1.9), drive(2.1)), atol=5e-3)
+    smooth = filled(seconds).samples(ns(1), ns(3))
+    noise = [odometry_noise(history, 100_000_000) for history in (buffer.samples(ns(1), ns(3)), smooth)]
+    assert np.allclose(noise[0], noise[1], atol=1e-6)
 
 
 def test_nothing_is_known_before_after_and_across_a_gap() -> None:

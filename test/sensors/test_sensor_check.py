@@ -59,6 +59,10 @@ def test_sensors_as_they_are_agree(drive: Drive) -> None:
     assert seen.forward[0] > 0.9 and seen.left_contrast > 10 and seen.returns > 1000
 
 
+def test_scans_without_odometry_say_nothing_about_its_clock(drive: Drive) -> None:
+    assert checked(drive, lambda frame: replace(frame, odom_T_body=None, motion=None)).lidar is None
+
+
 @pytest.mark.parametrize("axis", range(3))
 def test_a_lidar_that_is_mounted_otherwise_than_stated_is_found(drive: Drive, axis: int) -> None:
     turn = np.radians(10) * np.eye(3)[axis]

@@ -28,6 +28,7 @@ _HELP = {
     "fields": "the cloud needs fields x, y and z",
     "stamp": "the driver must set header.stamp",
     "pose": "the odometry must send unit quaternions",
+    "position jump": "the odometry's positions must be in metres and continuous",
     "transforms": "calibration names a file that says how the sensors are mounted",
     "camera_info": "calibration names a file with the intrinsics",
     "late": "a larger sync.max_wait_s waits longer",

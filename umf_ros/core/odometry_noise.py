@@ -1,10 +1,11 @@
-"""Error model of odometry: a random walk along the path."""
+"""Error model of odometry: a random walk along the path, and jumps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.config import PoseGraphSettings
@@ -12,6 +13,24 @@ from umf_ros.core.geometry import Array
 
 # by hand: path length that a turn by a radian and a second count as, m
 _M_PER_RAD, _M_PER_S = 0.5, 1e-4
+# by hand: a step is a jump if it exceeds the speed of the steps before by as much again, an acceleration (rad/s^2,
+# m/s^2) during it, and this (rad, m)
+_JUMP, _ACCELERATION = np.array([np.deg2rad(5.0), 0.3]), np.array([np.deg2rad(300.0), 5.0])
+STEPS_BEFORE = 9
+
+
+def jump_excess(lengths: Array, seconds: ArrayLike, speeds: Array) -> Array:
+    """Return by how much steps of the odometry are too long for those before them, rad and m; 0 unless they jump.
+
+    Args:
+        lengths: (..., 2) of the steps, rad and m.
+        seconds: (...) of the steps.
+        speeds: (..., 2, `STEPS_BEFORE`) of those before, rad/s and m/s.
+    """
+    elapsed_s = np.asarray(seconds)[..., None]
+    usual = np.median(speeds, axis=-1) * elapsed_s
+    too_long = lengths - usual
+    return np.where(too_long > _JUMP + usual + _ACCELERATION * elapsed_s**2, too_long, 0.0)
 
 
 @dataclass(frozen=True)

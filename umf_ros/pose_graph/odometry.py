@@ -19,7 +19,7 @@ from umf_ros.core.geometry import (
     propagate,
     ros_to_gtsam_covariance,
 )
-from umf_ros.core.odometry_noise import OdometryNoise
+from umf_ros.core.odometry_noise import STEPS_BEFORE, OdometryNoise, jump_excess
 from umf_ros.core.table import Table
 from umf_ros.core.trajectory import bracket, interpolated
 from umf_ros.sensors.sessions import ANY_SPEED, LONGEST_SILENCE_S, SILENCE_NS, USUAL_GAPS
@@ -45,10 +45,6 @@ conditioned."""
 # by hand: standard deviations of the constant errors of a rover's odometry, which no covariance states: heading, rad/m,
 # and scale (wheels that slip in sand, a track width or a stereo baseline that is wrong)
 _DRIFT_SIGMAS = np.array([np.deg2rad(0.2), 0.03])
-# by hand: a step is a jump if it exceeds the speed of the steps before by as much again, an acceleration (rad/s^2,
-# m/s^2) during it, and this (rad, m)
-_JUMP, _ACCELERATION = np.array([np.deg2rad(5.0), 0.3]), np.array([np.deg2rad(300.0), 5.0])
-_STEPS_BEFORE = 9
 # by hand: silence, s, after which a rover may have moved at its recent speed, or at any rover's, all the time
 _FREE_S = 2.0
 
@@ -224,20 +220,19 @@ class OdometryChain:
         They are 0 but for steps that jump or span a silence. The speed and the period of a step are compared with the
         medians of those before, so that later messages do not change it.
         """
-        first = max(start - _STEPS_BEFORE, 0)
+        first = max(start - STEPS_BEFORE, 0)
         stamps, poses = self._messages["stamp"][first:], self._messages["pose"][first:]
         sigmas = np.zeros((len(stamps), 2))
-        if len(stamps) > _STEPS_BEFORE + 1:
+        if len(stamps) > STEPS_BEFORE + 1:
             periods = np.diff(stamps)[:, None] / 1e9
             lengths = np.linalg.norm(logmap(invert(poses[:-1]) @ poses[1:]).reshape(-1, 2, 3), axis=2)
-            before = sliding_window_view(np.hstack([lengths / periods, periods])[:-1], _STEPS_BEFORE, axis=0)
-            usual, seconds = np.median(before, axis=2), periods[_STEPS_BEFORE:]
-            too_long = lengths[_STEPS_BEFORE:] - usual[:, :2] * seconds
-            limits = _JUMP + usual[:, :2] * seconds + _ACCELERATION * seconds**2
+            before = sliding_window_view(np.hstack([lengths / periods, periods])[:-1], STEPS_BEFORE, axis=0)
+            usual, seconds = np.median(before, axis=2), periods[STEPS_BEFORE:]
+            jumped = jump_excess(lengths[STEPS_BEFORE:], seconds[:, 0], before[:, :2])
             free_s = np.minimum(seconds, LONGEST_SILENCE_S)
             unseen = np.maximum(usual[:, :2], ANY_SPEED[::-1]) * free_s * np.minimum(free_s / _FREE_S, 1.0)
             unseen[seconds[:, 0] <= np.maximum(SILENCE_NS / 1e9, USUAL_GAPS * usual[:, 2])] = 0.0
-            sigmas[_STEPS_BEFORE + 1 :] = np.where(too_long > limits, too_long, np.minimum(unseen, [np.pi, np.inf]))
+            sigmas[STEPS_BEFORE + 1 :] = np.where(jumped > 0, jumped, np.minimum(unseen, [np.pi, np.inf]))
         sigmas[: start - first + 1] = 0.0  # known before
         return sigmas[start - first :]
 

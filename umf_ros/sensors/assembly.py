@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Frame, Points, ScanMotion
-from umf_ros.core.geometry import Array, invert, relative, transform
+from umf_ros.core.geometry import Array, expmap, invert, logmap, relative, transform
+from umf_ros.core.odometry_noise import STEPS_BEFORE, jump_excess
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
@@ -37,21 +38,43 @@ UNKNOWN_NOISE = np.array([1e-4] * 3 + [2e-5] * 3)
 
 
 class OdometryBuffer:
-    """The poses of the odometry in the latest `length_s`, interpolated across gaps up to `max_gap_s`."""
+    """The poses of the odometry in the latest `length_s`, interpolated across gaps up to `max_gap_s`.
+
+    Paths and samples are without jumps, as where a filter took a GNSS fix: they would distort a scan. The motion during
+    a jump is that before it; `at` returns the poses with their jumps.
+    """
 
     def __init__(self, length_s: float, max_gap_s: float) -> None:
         self._length_ns, self._max_gap_s = round(length_s * 1e9), max_gap_s
         self._stamps: list[int] = []
         self._poses: list[Array] = []
+        self._origins: list[Array] = []
+        self._odom_T_path: Array = np.eye(4)
+        self._twists: deque[Array] = deque(maxlen=STEPS_BEFORE)
 
     def add(self, stamp_ns: int, odom_T_body: Array) -> None:
         """Append a pose, later than all before."""
+        if self._stamps:
+            self._odom_T_path = self._without_jump((stamp_ns - self._stamps[-1]) * 1e-9, odom_T_body)
         self._stamps.append(stamp_ns)
-        self._poses.append(odom_T_body)
+        self._poses.append(invert(self._odom_T_path) @ odom_T_body)
+        self._origins.append(self._odom_T_path)
         # lists are cut rarely and in bulk; bisection wants lists
         if self._stamps[0] < stamp_ns - 2 * self._length_ns:
             old = bisect_left(self._stamps, stamp_ns - self._length_ns)
-            del self._stamps[:old], self._poses[:old]
+            del self._stamps[:old], self._poses[:old], self._origins[:old]
+
+    def _without_jump(self, seconds: float, odom_T_body: Array) -> Array:
+        """Return `odom_T_path` (4, 4), another one than before if a step jumps."""
+        last, origin = self._poses[-1], self._odom_T_path
+        twist = logmap(relative(origin @ last, odom_T_body)[None])[0] / seconds
+        if len(self._twists) == STEPS_BEFORE:
+            speeds = np.linalg.norm(np.reshape([*self._twists, twist], (-1, 2, 3)), axis=2).T
+            if jump_excess(speeds[:, -1] * seconds, seconds, speeds[:, :-1]).any():
+                twist = self._twists[-1]
+                origin = odom_T_body @ invert(last @ expmap(twist[None] * seconds)[0])
+        self._twists.append(twist)
+        return origin
 
     def passed(self, stamp_ns: int) -> bool:
         """Return whether the odometry has reached a stamp."""
@@ -60,10 +83,10 @@ class OdometryBuffer:
     def at(self, stamp_ns: int) -> Array | None:
         """Return `odom_T_body` at a stamp, or None outside of the known poses."""
         poses = self.path(stamp_ns, stamp_ns).poses
-        return poses[0] if len(poses) else None
+        return self._origins[max(bisect_right(self._stamps, stamp_ns) - 1, 0)] @ poses[0] if len(poses) else None
 
     def path(self, start_ns: int, end_ns: int) -> Trajectory:
-        """Return poses `odom_T_body` from start to end, both interpolated, as far as they are known; possibly none."""
+        """Return poses `path_T_body` from start to end, both interpolated, as far as they are known; possibly none."""
         first, last = bisect_left(self._stamps, start_ns), bisect_left(self._stamps, end_ns)
         stamps = np.unique(np.array([start_ns, *self._stamps[first:last], end_ns], np.int64))
         poses, known = self._between(max(first - 1, 0), last + 1).at(stamps, self._max_gap_s)
@@ -76,8 +99,9 @@ class OdometryBuffer:
 
     def clear(self) -> None:
         """Delete all poses."""
-        self._stamps.clear()
-        self._poses.clear()
+        for held in (self._stamps, self._poses, self._origins, self._twists):
+            held.clear()
+        self._odom_T_path = np.eye(4)
 
     def _between(self, first: int, last: int) -> Trajectory:
         poses = np.array(self._poses[first:last]).reshape(-1, 4, 4)
@@ -126,6 +150,9 @@ MOST = 0.8
 """A limit that would drop more than this share of all returns so far was written for another sensor (*by hand*: the
 Cube-1's drops a quarter of a scan at most, one written for 0 to 4095 drops all of 0 to 1)."""
 
+FARTHEST_M = 500.0
+"""Median range beyond that of any LiDAR (*by hand*): points in centimetres or millimetres."""
+
 
 class ScanLimits:
     """Filter of weak returns and of returns far above or below the LiDAR.
@@ -159,6 +186,10 @@ class ScanLimits:
             hint = f"intensities reach {self._strongest:.3g}"
             # drivers send 0 where there is no intensity: not counted
             keep = keep & self._limited(f"min_intensity {self._min_intensity:g}", strong, cloud.intensity > 0, hint)
+        range_m = float(np.median(np.linalg.norm(cloud.points, axis=1))) if len(cloud.points) else 0.0
+        if range_m > FARTHEST_M:
+            where = f"half of a scan's returns are beyond {range_m:.0f} m"
+            self._warn_once("units", f"{where}: points have to be in metres (REP 103); such scans give no closures")
         if not keep.any():
             self._warn_once("empty", f"a scan of {len(keep)} returns, none of them usable; such scans are skipped")
         return Cloud(
@@ -308,12 +339,12 @@ def assemble(
     session: int,
 ) -> Frame:
     """Build the frame at `anchor.stamp_ns`: images (H, W) uint8 rectified, motion between the measurements removed."""
-    odom_T_body = odometry.at(anchor.stamp_ns)
-    points, intensity, motion = _scan(anchor, odometry, calibration, odom_T_body)
-    exposed = odometry.at(left.stamp_ns) if left else None
+    here = odometry.path(anchor.stamp_ns, anchor.stamp_ns).poses
+    points, intensity, motion = _scan(anchor, odometry, calibration, here)
+    exposed = odometry.path(left.stamp_ns, left.stamp_ns).poses if left else here[:0]
     body_T_camera = calibration.body_T_camera
-    if exposed is not None and odom_T_body is not None:  # at the exposure, in the body frame at the stamp
-        body_T_camera = relative(odom_T_body, exposed) @ body_T_camera
+    if len(exposed) and len(here):  # at the exposure, in the body frame at the stamp
+        body_T_camera = relative(here[0], exposed[0]) @ body_T_camera
     rectify = calibration.rectifier.apply if calibration.rectifier else lambda image, side: image
     return Frame(
         stamp_ns=anchor.stamp_ns,
@@ -324,7 +355,7 @@ def assemble(
         right=rectify(right.value, 1) if right else None,
         points=points,
         intensity=intensity,
-        odom_T_body=odom_T_body,
+        odom_T_body=odometry.at(anchor.stamp_ns),
         image_stamp_ns=left.stamp_ns if left else None,
         session=session,
         motion=motion,
@@ -332,30 +363,33 @@ def assemble(
 
 
 def _scan(
-    anchor: Anchor, odometry: OdometryBuffer, calibration: Calibration, odom_T_body: Array | None
+    anchor: Anchor, odometry: OdometryBuffer, calibration: Calibration, here: Array
 ) -> tuple[Points | None, Points | None, ScanMotion | None]:
-    """Return points in the body frame at the anchor's key, their intensity, and the motion that was removed."""
+    """Return points in the body frame at the anchor's key, their intensity, and the motion that was removed.
+
+    `here` is `path_T_body` at the key, (1, 4, 4), or (0, 4, 4) where it is unknown.
+    """
     cloud = anchor.cloud
     if cloud is None or not len(cloud.points):
         return None, None, None
     points = transform(calibration.body_T_lidar, cloud.points)
     motion = None
-    if odom_T_body is not None and cloud.time_offset_ns is not None:
+    if len(here) and cloud.time_offset_ns is not None:
         path = odometry.path(*anchor.span_ns())
         if len(path):
             stamps = anchor.measured_ns + cloud.time_offset_ns
-            points = deskew(points, stamps, path, odom_T_body)
+            points = deskew(points, stamps, path, here[0])
             motion = scan_motion((stamps - anchor.stamp_ns) * 1e-9, anchor.span_ns(), path, odometry)
     return points, cloud.intensity, motion
 
 
-def deskew(points: Points, point_stamps_ns: NDArray[np.int64], path: Trajectory, odom_T_body: Array) -> Points:
-    """Return points (N, 3) float32, m, each in the body frame at its stamp (N,), as measured from `odom_T_body`.
+def deskew(points: Points, point_stamps_ns: NDArray[np.int64], path: Trajectory, path_T_body: Array) -> Points:
+    """Return points (N, 3) float32, m, each in the body frame at its stamp (N,), as measured from `path_T_body`.
 
     `path` is the odometry over the scan, at least one pose. Between them the motion is taken as
     uniform; before the first and after the last the rover is assumed to stand.
     """
-    moved = invert(odom_T_body) @ path.poses
+    moved = invert(path_T_body) @ path.poses
     turns = Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()
     # relative to the first stamp: nanoseconds since the epoch do not fit a float
     times = (path.stamps_ns - path.stamps_ns[0]).astype(float)

@@ -351,7 +351,9 @@ class SensorCheck:
         self.contradictions = find_contradictions(self._motion(odometry, search_clock=False))
 
     def _step(self, earlier: Frame, later: Frame) -> None:
-        if earlier.points is not None and later.points is not None:
+        # without odometry, the motion during the scans and so their mean time are unknown
+        is_tracked = earlier.odom_T_body is not None and later.odom_T_body is not None
+        if is_tracked and earlier.points is not None and later.points is not None:
             known, before = self._last_scan
             before, after = before if known is earlier else as_measured(earlier), as_measured(later)
             self._last_scan = later, after

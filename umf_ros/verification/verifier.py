@@ -350,9 +350,7 @@ def _most_probable(judged: list[Hypothesis]) -> dict[int, Hypothesis]:
     return {one.candidate.index: one for one in sorted(judged, key=lambda one: one.probability or 0.0)}
 
 
-def _along(
-    hypothesis: Hypothesis, passages: list[tuple[Hypothesis, Position]]
-) -> tuple[Hypothesis, Position] | None:
+def _along(hypothesis: Hypothesis, passages: list[tuple[Hypothesis, Position]]) -> tuple[Hypothesis, Position] | None:
     """Return the hypothesis about the same candidate whose positions along a passage this one's pose is among."""
     same = (one for one in passages if one[0].candidate is hypothesis.candidate)
     return next((one for one in same if one[1].compared(hypothesis.pose)), None)

@@ -297,6 +297,16 @@ def test_rotations_in_degrees_are_found() -> None:
     assert _errors(G2oGraph(content.poses, edges))[1] == _errors(content_of(LAPS))[1]
 
 
+def test_positions_in_millimetres_are_found_beside_wrong_closures() -> None:
+    content, scale = content_of(FALSE), np.diag([1] * 3 + [1e3] * 3)
+    edges = [edge._replace(covariance=scale @ edge.covariance @ scale) for edge in content.edges]
+    _, said = in_units(as_recording(G2oGraph(content.poses, edges)))
+    assert "x 0.001 (positions of odometry, positions of closures)" in said
+    found, closures = _errors(G2oGraph(content.poses, edges))
+    plain, right = _errors(content_of(LAPS))
+    assert found == pytest.approx(plain, rel=0.05) and closures == right
+
+
 def test_right_units_stay_as_they_are() -> None:
     for world in (LAPS, FALSE, with_wrong_closures(rover_loops(300, 12), 0.6, "groups", 1)):
         assert in_units(as_recording(content_of(world)))[1] == ""

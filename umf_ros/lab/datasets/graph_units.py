@@ -62,11 +62,13 @@ def _decades(residuals: Array, noises: Array, wrong: Array) -> Array:
             for direction in np.array(model):
                 tried = [found + shift * direction for shift in _DECADES]
                 found = tried[int(np.argmax([merit(one) for one in tried]))]
-        if merit(found) > best_merit:
+        # odometry and closures of one file differ by orders or not: less is a misjudgement
+        is_apart = _ODOMETRY not in model or np.abs(found - best).max() >= _ORDERS
+        if merit(found) > best_merit and is_apart:
             best, best_merit = found, merit(found) + _GAIN
     # loops that fit the stated noise are right by chance no more than one in 10,000 if it is ten times larger
     fitting = squared_mahalanobis(residuals, _covariances(np.zeros(4), noises)) < chdtri(residuals.shape[1], 0.01)
-    stated = best.max() > 0 and fitting.sum() >= max(_FITTING, _FITTING_SHARE * len(residuals))
+    stated = best.max() >= _ORDERS and fitting.sum() >= max(_FITTING, _FITTING_SHARE * len(residuals))
     return np.zeros(4) if stated or np.abs(best).max() < _ORDERS else best
 
 
