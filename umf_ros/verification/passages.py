@@ -90,7 +90,7 @@ class PassagePosition(NamedTuple):
     def sigmas(self, misfits: Array, known: NDArray[np.bool_]) -> Array:
         """(K,) by how many standard deviations rivals fit worse, as metres along the passage vary."""
         worse = np.where(known & self.known, misfits - self.misfits, 0.0)
-        sums = np.stack([np.bincount(self.metre, row) for row in worse])
+        sums = _by_metre(worse, self.metre)
         return np.asarray(sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9))
 
     def compared(self, pose: Array) -> bool:
@@ -141,7 +141,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     means = _means(misfits, known)
     rivals = Rivals(poses, means, misfits, known)
     first = int(np.argmin(means[: 1 + len(aligned)]))
-    metre = _metres(match, query, way, poses[first])
+    metre = _metres([transform(poses[first], half) for half in _halves(query)] + _halves(match), way)
     found = PassagePosition(poses[first], way, means[first], misfits[first], known[first], metre, rivals)
     elsewhere = found.elsewhere
     if not elsewhere.any():
@@ -160,7 +160,7 @@ def undisputed(found: PassagePosition, match: PreparedScan, query: PreparedScan,
     """
     rivals = found.rivals
     misfits, known = _misfits(match, query, pose[None])
-    metre = _metres(match, query, found.way, pose)
+    metre = _metres([transform(pose, half) for half in _halves(query)] + _halves(match), found.way)
     here = found._replace(pose=pose, misfits=misfits[0], known=known[0], metre=metre)
     elsewhere = here.elsewhere
     needed = const.UNDISPUTED_SIGMAS if known.mean() > const.PASSAGE_KNOWN else 0.0
@@ -176,8 +176,10 @@ class FacedPosition(NamedTuple):
         fit: logarithm of the mean misfit of these surfaces.
         worse: how much larger it is elsewhere along the passage.
         evidence: number of points that fit here and not there, at the rival that fits most of them.
+        further: the same without the metre of the passage with most of them.
         better: (4, 4) the pose elsewhere at which they fit best, where that is better than here.
         rival_far: as in `ambiguity`, of all points; 0 while it is unknown.
+        turned: whether it is turned round to what is expected: the other end of a passage often looks the same.
     """
 
     pose: Array
@@ -185,14 +187,17 @@ class FacedPosition(NamedTuple):
     fit: float
     worse: float
     evidence: float
+    further: float
     better: Array | None
     rival_far: float = 0.0
+    turned: bool = False
 
     @property
     def lead(self) -> float:
         """How much worse the scans fit elsewhere, as a share of what a closure needs."""
-        both = self.evidence + const.FACING_POINT * self.rival_far
-        return min(self.worse / const.FACING_LEAD, self.evidence / const.FACING_LEAST, both)
+        evidence = self.further if self.turned else self.evidence
+        both = evidence + const.FACING_POINT * self.rival_far
+        return min(self.worse / const.FACING_LEAD, evidence / const.FACING_LEAST, both)
 
     @property
     def decides(self) -> bool:
@@ -222,15 +227,13 @@ def face_along(match: PreparedScan, query: PreparedScan, pose: Array) -> FacedPo
     way = passage_way(match, query, pose)
     if way is None:
         return None
+    ours, theirs = _facing(query, pose[:3, :3].T @ way), _facing(match, way)
     sigma_m = max(const.FACING_SIGMA_M, const.PLANE_SIGMA_M + 2 * common_blur(match, query))
     poses = np.concatenate([pose[None], shifted(pose, way, const.FACING_SHIFTS_M)])
     parts = [
         _misfits_with(scan, planes, points, at, sigma_m)
-        for scan, other, at, ahead in (
-            (match, query, poses, pose[:3, :3].T @ way),
-            (query, match, invert(poses), way),
-        )
-        for planes, points in zip(scan.surfaces, _facing(other, ahead), strict=True)
+        for scan, halves, at in ((match, ours, poses), (query, theirs, invert(poses)))
+        for planes, points in zip(scan.surfaces, halves, strict=True)
     ]
     misfits, known = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
     counts = known.sum(axis=1)
@@ -240,9 +243,11 @@ def face_along(match: PreparedScan, query: PreparedScan, pose: Array) -> FacedPo
         return None
     best = rivals[fits[rivals].argmin()]
     # what repeats is seen here, and there from another side: the same points have to tell both apart
-    evidence = np.where(known[rivals] & known[0], misfits[rivals] - misfits[0], 0.0).sum(axis=1).min()
+    told = np.where(known[rivals] & known[0], misfits[rivals] - misfits[0], 0.0)
+    metre = _metres([transform(pose, half) for half in ours] + theirs, way)
+    further = (told.sum(axis=1) - _by_metre(told, metre).max(axis=1)).min()
     worse, better = float(fits[best] - fits[0]), poses[best] if fits[best] < fits[0] else None
-    return FacedPosition(pose, way, float(fits[0]), worse, float(evidence), better)
+    return FacedPosition(pose, way, float(fits[0]), worse, float(told.sum(axis=1).min()), float(further), better)
 
 
 def _facing(scan: PreparedScan, way: Array) -> list[Array]:
@@ -254,11 +259,15 @@ def _facing(scan: PreparedScan, way: Array) -> list[Array]:
     return found
 
 
-def _metres(match: PreparedScan, query: PreparedScan, way: Array, pose: Array) -> NDArray[np.int64]:
-    """(N,) of each point of both scans along a passage, from 0 on, at a pose (4, 4) `match_T_query`."""
-    points = [transform(pose, half) for half in _halves(query)] + _halves(match)
+def _metres(points: list[Array], way: Array) -> NDArray[np.int64]:
+    """(N,) of each of several groups of points along a passage, from 0 on."""
     metre = np.floor(np.concatenate(points) @ way).astype(np.int64)
-    return metre - metre.min()
+    return metre - metre.min(initial=0)
+
+
+def _by_metre(values: Array, metre: NDArray[np.int64]) -> Array:
+    """(K, metres) sums of values (K, N) over the points of each metre."""
+    return np.stack([np.bincount(metre, row) for row in values])
 
 
 def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Misfits:

@@ -11,7 +11,7 @@ import numpy as np
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Keyframe, LoopClosure
-from umf_ros.core.geometry import Array, heading
+from umf_ros.core.geometry import Array, heading, invert, relative
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
@@ -238,7 +238,9 @@ class Verifier:
                 self._measure(hypothesis)
                 faced = face_along(theirs, ours, hypothesis.pose) or faced
             of_points = ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
-            faced = faced._replace(rival_far=of_points["rival_far"])
+            query, match = hypothesis.keyframes
+            turned = _is_turned(query, match, hypothesis.pose)
+            faced = faced._replace(rival_far=of_points["rival_far"], turned=turned)
             hypothesis.measurements["lead"] = faced.lead  # the probability is that of a pose in a passage
             return faced
         assert not isinstance(compared, FacedPosition)
@@ -348,6 +350,13 @@ class Verifier:
 def _most_probable(judged: list[Hypothesis]) -> dict[int, Hypothesis]:
     """Of hypotheses about each candidate, by its index, the one that decides."""
     return {one.candidate.index: one for one in sorted(judged, key=lambda one: one.probability or 0.0)}
+
+
+def _is_turned(query: Keyframe, match: Keyframe, pose: Array) -> bool:
+    """Whether a pose `match_T_query` is turned round to what odometry has, or where there is none, to the match."""
+    if query.session == match.session and query.odom_T_body is not None and match.odom_T_body is not None:
+        pose = invert(relative(match.odom_T_body, query.odom_T_body)) @ pose
+    return abs(float(heading(pose))) > np.pi / 2
 
 
 def _along(hypothesis: Hypothesis, passages: list[tuple[Hypothesis, Position]]) -> tuple[Hypothesis, Position] | None:
