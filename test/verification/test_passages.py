@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from umf_ros.verification import Hypothesis, RejectReason, Verifier, verifier
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import known_only
-from umf_ros.verification.passages import PassagePosition, Rivals, _peaks, locate_along, undisputed
+from umf_ros.verification.passages import PassagePosition, Rivals, _peaks, face_along, locate_along, undisputed
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import align_scans
 from umf_ros.verification.scan_consistency import ambiguity, compare_scans
@@ -327,3 +328,73 @@ def test_a_pose_beside_the_best_position_stays_as_it_is() -> None:
     for begun_m, end_m in ((1.7, 1.7), (3.0, 1.5)):
         found = locate_along(match, query, shift(begun_m))
         assert found is not None and found.pose[0, 3] == pytest.approx(end_m, abs=0.1)
+
+
+def ended(x: float, seed: int, cupboards: tuple[float, ...] = CUPBOARDS, other_m: float = -25.0) -> PreparedScan:
+    """A scan in a corridor with walls across it at 4.5 m and at the other end."""
+    ways = rays()
+    with np.errstate(divide="ignore"):
+        ends = np.where(ways[:, 0] > 0, 4.5 - x, other_m - x) / ways[:, 0]
+    return scan(np.minimum(corridor_ranges(ways, x, cupboards, 0.3), ends), seed)
+
+
+@pytest.mark.parametrize("begun_m", [1.5, 0.0, -1.5, 3.0])
+def test_the_end_of_a_passage_tells_where_in_it_two_scans_were_taken(begun_m: float) -> None:
+    """Wherever along it the search ended."""
+    match, query = ended(0.0, 1), ended(1.5, 2)
+    here, found = face_along(match, query, shift(1.5)), face_along(match, query, shift(begun_m))
+    assert here is not None and here.decides and here.better is None
+    assert found is not None and found.decides == (begun_m == 1.5)
+    assert found.better is None or found.better[0, 3] == pytest.approx(1.5, abs=0.1)
+    verdict = verdict_of(match, query, shift(begun_m))
+    assert verdict.closure is not None and abs(verdict.pose[0, 3] - 1.5) < 0.05
+
+
+def test_an_end_and_walls_are_what_many_passages_have() -> None:
+    verdict = verdict_of(ended(0.0, 1, (), -60.0), ended(1.5, 2, (), -60.0), shift(1.5))
+    assert verdict.closure is None and verdict.reason is RejectReason.WALLS_ALONE
+
+
+def test_the_other_end_of_a_passage_is_not_taken_for_this_one() -> None:
+    """Turned round, both scans are three metres and more before a wall."""
+    match, query, turned = ended(0.0, 1), ended(-22.0, 2), np.diag([-1.0, -1.0, 1.0])
+    alias = make_pose(turned, [1.5, 0.0, 0.0])
+    found = face_along(match, query, alias)
+    assert found is not None and found.decides and not found._replace(turned=True).decides
+    assert verdict_of(match, query, alias).closure is None
+
+
+@pytest.mark.parametrize(("driven_deg", "pose_deg", "expected"), [(0, 180, True), (180, 180, False), (170, 0, True)])
+def test_a_pose_is_turned_round_to_what_odometry_has(driven_deg: float, pose_deg: float, expected: bool) -> None:
+    def turned(degrees: float) -> Array:
+        return make_pose(Rotation.from_euler("z", degrees, degrees=True).as_matrix(), [1.0, 0.0, 0.0])
+
+    points = np.zeros((0, 3), np.float32)
+    match, query = (
+        Keyframe(stamp_ns, Embedding(np.ones(4, np.float32)), CAMERA, BODY_T_CAMERA, points, odom)
+        for stamp_ns, odom in ((1, turned(30)), (2, turned(30 + driven_deg)))
+    )
+    assert verifier._is_turned(query, match, turned(pose_deg)) == expected
+    assert verifier._is_turned(replace(query, session=1), match, turned(pose_deg)) == (pose_deg == 180)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_person_who_walked_on_is_no_evidence_of_a_position(seed: int) -> None:
+    """A round body is no surface that faces along a passage."""
+    rng = np.random.default_rng(seed)
+    x, radius, *seen = rng.uniform((-5, 0.2, 1.5, 1.5), (5, 0.3, 5, 5)).tolist()
+    match, query = (
+        scan(np.minimum(corridor_ranges(rays(), at, UNEVEN[:2], 0.3), person_ranges(rays(), away, radius)), number)
+        for number, (at, away) in enumerate(zip((0.0, x), seen, strict=True))
+    )
+    verdict = verdict_of(match, query, shift(seen[0] - seen[1]))
+    assert verdict.closure is None or abs(verdict.pose[0, 3] - x) < 0.3
+
+
+def person_ranges(ways: Array, ahead_m: float, radius: float) -> Array:
+    """(N,) distances to an upright cylinder, 1.75 m high, on the floor ahead."""
+    square, half, rest = ways[:, 0] ** 2 + ways[:, 1] ** 2, ways[:, 0] * ahead_m, ahead_m**2 - radius**2
+    with np.errstate(invalid="ignore"):
+        reach = (half - np.sqrt(half**2 - square * rest)) / square
+    height = reach * ways[:, 2] + LIDAR_M
+    return np.where((reach > 0) & (height > 0) & (height < 1.75), reach, np.inf)
