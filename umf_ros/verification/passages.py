@@ -4,7 +4,8 @@ Scans look much the same all along. The pattern of one sensor lies on floor, wal
 it stands. Points of two scans therefore coincide at the identity pose although the places differ, and an alignment of
 points that begins near it stays there. All positions along a passage are therefore compared, and a point's distance is
 that to a plane of the other scan. Points of one half of a scan, every second band of elevations, are compared with
-planes of the other half alone: no ring meets itself.
+planes of the other half alone: no ring meets itself. Planes that face along the passage decide (`face_along`), and all
+planes (`locate_along`) where too few of those are known.
 """
 
 from __future__ import annotations
