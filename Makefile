@@ -3,8 +3,9 @@
 # make test-jazzy   the suite with the versions of an installed Jazzy (NumPy 1.26.4), in a separate venv
 # make check   lint and the fast tests, about two minutes
 # make lint   ruff, mypy, codespell, the import contracts and the rules of prose
+# make bench   CPU per scan of a replay and its parts
 # make docs   the documentation as a site, build/site
-.PHONY: demo test check test-jazzy lint docs install clean
+.PHONY: demo test check test-jazzy lint bench docs install clean
 SHELL := /bin/bash
 
 VENV ?= .venv
@@ -50,6 +51,9 @@ lint: install
 	@$(BIN)/lint-imports --no-logo
 	@$(BIN)/codespell
 	@$(BIN)/python tools/style_check.py
+
+bench: install
+	@$(BIN)/python benchmarks/scale/cpu.py
 
 # every page and every link, as a site in build/site
 docs: install
