@@ -221,6 +221,9 @@ def packed(compress: Callable[[bytes], bytes], name: str, folder: Path) -> None:
     (folder / "drive.mcap").unlink()
 
 
+_COMPRESSIONS: dict[str, Callable[[bytes], bytes]] = {"gz": gzip.compress, "bz2": bz2.compress}
+
+
 def _about(axis: str, degrees: float) -> Array:
     return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
 
@@ -285,7 +288,7 @@ CASES = [
         Case(
             f"n11 {end}", partial(packed, make, f"a.mcap.{end}"), ("replay", f"a.mcap.{end}"), f"names {end}", says(end)
         )
-        for end, make in {"gz": gzip.compress, "bz2": bz2.compress}.items()
+        for end, make in _COMPRESSIONS.items()
     ),
     # the first scans stay in parts, by which these are recognised
     *(
