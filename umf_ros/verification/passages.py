@@ -5,7 +5,7 @@ it stands. Points of two scans therefore coincide at the identity pose although 
 points that begins near it stays there. All positions along a passage are therefore compared, and a point's distance is
 that to a plane of the other scan. Points of one half of a scan, every second band of elevations, are compared with
 planes of the other half alone: no ring meets itself. Planes that face along the passage decide (`face_along`), and all
-planes (`locate_along`) where too few of those are known.
+planes (`locate_along`) where those do not.
 """
 
 from __future__ import annotations

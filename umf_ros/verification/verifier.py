@@ -26,7 +26,7 @@ from umf_ros.verification.pose_search import (
 )
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
-from umf_ros.verification.scan_alignment import align_scans, inspect
+from umf_ros.verification.scan_alignment import Alignment, align_scans, inspect
 from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, repetition
 
 Position = PassagePosition | FacedPosition
@@ -214,16 +214,27 @@ class Verifier:
         of_pose = measure(hypothesis) | {"support": self._memory.support(query, match, hypothesis.pose)}
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
-    @staticmethod
-    def _replaces(hypothesis: Hypothesis, found: Position) -> bool:
-        """Whether a hypothesis stands for its passage in place of another before it."""
+    def _replaces(self, hypothesis: Hypothesis, found: Position) -> bool:
+        """Whether a hypothesis stands for its passage, where another before it found no position along it."""
+        if isinstance(found, FacedPosition) or found.decides:
+            return False
         theirs, ours = hypothesis.scans
-        faced = face_along(theirs, ours, hypothesis.pose)
-        if isinstance(found, FacedPosition):
-            return faced is not None and faced.fit < found.fit
-        if faced is not None:
-            return faced.decides
-        return not found.decides and undisputed(found, theirs, ours, hypothesis.pose)
+        return self._faced(hypothesis) is not None or undisputed(found, theirs, ours, hypothesis.pose)
+
+    @staticmethod
+    def _faced(hypothesis: Hypothesis) -> tuple[FacedPosition, Alignment] | None:
+        """The position along a passage that surfaces which face along it decide on, and the alignment there."""
+        (theirs, ours), (query, match), alignment = hypothesis.scans, hypothesis.keyframes, hypothesis.alignment
+        assert isinstance(alignment, Alignment)
+        found = face_along(theirs, ours, alignment.pose)
+        if found is not None and found.better is not None:
+            alignment = align_scans(theirs, ours, found.better)
+            found = face_along(theirs, ours, alignment.pose)
+        if found is None:
+            return None
+        rival_far = ambiguity(theirs, ours, alignment.pose, alignment.information)["rival_far"]
+        found = found._replace(rival_far=rival_far, turned=_is_turned(query, match, alignment.pose))
+        return (found, alignment) if found.decides else None
 
     def _look_elsewhere(self, hypothesis: Hypothesis, compared: Position | None) -> Position | None:
         """Compare with other poses; of scans in a passage, move to the best position along it, and return that.
@@ -232,17 +243,12 @@ class Verifier:
         """
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
-        if (faced := face_along(theirs, ours, hypothesis.pose)) is not None:
-            if faced.better is not None:
-                self._align(hypothesis, faced.better)
-                self._measure(hypothesis)
-                faced = face_along(theirs, ours, hypothesis.pose) or faced
-            of_points = ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
-            query, match = hypothesis.keyframes
-            turned = _is_turned(query, match, hypothesis.pose)
-            faced = faced._replace(rival_far=of_points["rival_far"], turned=turned)
-            hypothesis.measurements["lead"] = faced.lead  # the probability is that of a pose in a passage
-            return faced
+        if (faced := self._faced(hypothesis)) is not None:
+            position, hypothesis.alignment = faced
+            hypothesis.pose = position.pose
+            self._measure(hypothesis)
+            hypothesis.measurements["lead"] = position.lead  # the probability is that of a pose in a passage
+            return position
         assert not isinstance(compared, FacedPosition)
         found = compared or locate_along(theirs, ours, hypothesis.pose)
         if found is not None and (compared or undisputed(found, theirs, ours, hypothesis.pose)):
@@ -285,19 +291,19 @@ class Verifier:
         for one in hypotheses:
             ends = [other.pose for other in before + kept if other.candidate is one.candidate]
             if not any(same_pose(one.pose, end) for end in ends):
-                self._align(one, one.pose)
+                self._align(one)
                 if not any(same_pose(one.pose, end) for end in ends):
                     self._measure(one)
                     kept.append(one)
         return kept
 
-    def _align(self, hypothesis: Hypothesis, guess: Array) -> None:
+    def _align(self, hypothesis: Hypothesis) -> None:
         query, match = hypothesis.keyframes
         scans = self.scans[match], self.scans[query]
         if hypothesis.views is not None:
-            hypothesis.alignment = hypothesis.views.align(guess)
+            hypothesis.alignment = hypothesis.views.align(hypothesis.pose)
         else:
-            hypothesis.scans, hypothesis.alignment = scans, align_scans(*scans, guess)
+            hypothesis.scans, hypothesis.alignment = scans, align_scans(*scans, hypothesis.pose)
         hypothesis.pose = hypothesis.alignment.pose
 
     def _best(
