@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -46,7 +47,11 @@ def test_a_node_that_opens_its_models_and_files_ends_too(
         client = rclpy.create_node("client")
         change = client.create_client(ChangeState, "/pose_graph_node/change_state")
         assert change.wait_for_service(60.0)
-        change.call_async(ChangeState.Request(transition=Transition(label="configure")))
+        for _ in range(6):  # on a busy machine a request is lost while the endpoints still find each other
+            change.call_async(ChangeState.Request(transition=Transition(label="configure")))
+            with suppress(AssertionError):
+                process.wait_for("opening", 15.0)
+                break
     process.wait_for("opening")
     graph = process.child
     process.send(number)

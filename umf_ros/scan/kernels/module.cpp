@@ -204,6 +204,7 @@ nb::object means(const In<float, nb::shape<-1, 3>>& points, const In<float, nb::
 }  // namespace
 
 NB_MODULE(_kernels, module) {
+  nb::set_leak_warnings(false);  // an interpreter that is ended from outside keeps what it holds
   nb::class_<KdTree>(module, "KdTree")
       .def("__init__", [](KdTree* self, const Points& points) { new (self) KdTree(points.data(), points.shape(0)); })
       .def("__len__", &KdTree::size)
