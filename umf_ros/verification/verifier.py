@@ -188,8 +188,7 @@ class Verifier:
             rivals = [other for other in aligned if other.candidate is one.candidate]
             one.measurements |= runner_up(one, rivals)
             found = self._look_elsewhere(one, earlier[1] if earlier else None) if promises else None
-            if isinstance(found, FacedPosition):  # those along the passage have been compared
-                one.measurements.pop("runner_up", None)
+            if isinstance(found, FacedPosition):  # measured anew; those along the passage have been compared
                 one.measurements |= runner_up(one, [other for other in rivals if not found.compared(other.pose)])
             if earlier:
                 passages.remove(earlier)
