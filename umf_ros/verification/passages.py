@@ -201,6 +201,11 @@ class FacedPosition(NamedTuple):
         return min(self.worse / const.FACING_LEAD, evidence / const.FACING_LEAST, both)
 
     @property
+    def may_decide(self) -> bool:
+        """Whether it is, if all points fit worse elsewhere by enough."""
+        return self._replace(rival_far=np.inf, turned=False).decides
+
+    @property
     def decides(self) -> bool:
         """Whether it is the position of a closure."""
         return self.lead >= 1.0

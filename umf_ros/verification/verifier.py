@@ -229,7 +229,7 @@ class Verifier:
         if found is not None and found.better is not None:
             alignment = align_scans(theirs, ours, found.better)
             found = face_along(theirs, ours, alignment.pose)
-        if found is None:
+        if found is None or not found.may_decide:
             return None
         rival_far = ambiguity(theirs, ours, alignment.pose, alignment.information)["rival_far"]
         found = found._replace(rival_far=rival_far, turned=_is_turned(query, match, alignment.pose))
