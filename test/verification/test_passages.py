@@ -22,7 +22,15 @@ from umf_ros.verification import Hypothesis, RejectReason, Verifier, verifier
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import known_only
-from umf_ros.verification.passages import PassagePosition, Rivals, _peaks, face_along, locate_along, undisputed
+from umf_ros.verification.passages import (
+    PassagePosition,
+    Rivals,
+    _peaks,
+    face_along,
+    locate_along,
+    undisputed,
+    was_compared,
+)
 from umf_ros.verification.prepared_scan import PreparedScan, thin_scan
 from umf_ros.verification.scan_alignment import align_scans
 from umf_ros.verification.scan_consistency import ambiguity, compare_scans
@@ -298,7 +306,7 @@ def test_only_the_position_along_a_passage_may_differ_of_what_was_compared() -> 
     assert found is not None
     along, across, turned = shift(6.0), shift(0.0), shift(0.0)
     across[1, 3], turned[:3, :3] = 1.5, np.diag([-1.0, -1.0, 1.0])
-    assert found.compared(along) and not found.compared(across) and not found.compared(turned)
+    assert was_compared(found, along) and not was_compared(found, across) and not was_compared(found, turned)
 
 
 def test_in_a_passage_the_measurements_are_those_of_the_pose_that_was_taken() -> None:
@@ -360,7 +368,9 @@ def test_the_other_end_of_a_passage_is_not_taken_for_this_one() -> None:
     match, query, turned = ended(0.0, 1), ended(-22.0, 2), np.diag([-1.0, -1.0, 1.0])
     alias = make_pose(turned, [1.5, 0.0, 0.0])
     found = face_along(match, query, alias)
-    assert found is not None and found.decides and not found._replace(turned=True).decides
+    assert found is not None and found.decides
+    found = face_along(match, query, alias, turned=True)
+    assert found is not None and not found.decides
     assert verdict_of(match, query, alias).closure is None
 
 

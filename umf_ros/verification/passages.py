@@ -21,6 +21,8 @@ from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_bl
 from umf_ros.verification.scan_alignment import run_gicp
 from umf_ros.verification.scan_consistency import mean_misfits, near_identity, patterned, shifted
 
+Halves = tuple[list[Array], list[Array]]
+"""Points (N, 3) of each half of a query and of a match, the half first whose bands the first planes lie between."""
 Misfits = tuple[Array, NDArray[np.bool_]]
 """(K, N) of points at poses, from 0 on a surface to 1 off all or in space seen empty; and whether they are known."""
 
@@ -94,17 +96,6 @@ class PassagePosition(NamedTuple):
         sums = _by_metre(worse, self.metre)
         return np.asarray(sums.sum(axis=1) / np.maximum(np.sqrt((sums**2).sum(axis=1)), 1e-9))
 
-    def compared(self, pose: Array) -> bool:
-        """Whether a pose, up to its position along the passage, is this one: it was compared with it."""
-        return _along(self.pose, self.way, pose)
-
-
-def _along(pose: Array, way: Array, other: Array) -> bool:
-    """Whether another pose (4, 4) is a pose up to its position along a passage."""
-    moved = other.copy()
-    moved[:3, 3] += (pose[:3, 3] - other[:3, 3]) @ way * way
-    return near(moved, pose, const.DISTINCT_M, const.DISTINCT_RAD)
-
 
 def passage_way(match: PreparedScan, query: PreparedScan, pose: Array) -> Array | None:
     """Return the direction (3,) of the passage, match frame; None where neither scan shows one, and for submaps."""
@@ -130,7 +121,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     if way is None:
         return None
     along = shifted(pose, way, const.PASSAGE_SHIFTS_M)
-    best = along[_peaks(_means(*_misfits(match, query, along, const.SCOUT_EVERY)))]
+    best = along[_peaks(_means(*_misfits(match, query, along, _halves(match, query, const.SCOUT_EVERY))))]
     distinct: list[tuple[Array, Array]] = []
     for one in best:  # half of them end where another does: a few points show it
         end = run_gicp(match, query.oriented_scouts, one, const.FINE_REACH_M)
@@ -138,11 +129,11 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
             distinct.append((one, end))
     aligned = [run_gicp(match, query.oriented_sample, one, const.FINE_REACH_M) for one, _ in distinct]
     poses = np.stack([pose, *aligned, *best])  # alignments may all end at one pose
-    misfits, known = _misfits(match, query, poses)
+    misfits, known = _misfits(match, query, poses, _halves(match, query))
     means = _means(misfits, known)
     rivals = Rivals(poses, means, misfits, known)
     first = int(np.argmin(means[: 1 + len(aligned)]))
-    metre = _metres([transform(poses[first], half) for half in _halves(query)] + _halves(match), way)
+    metre = _metres(_halves(match, query), way, poses[first])
     found = PassagePosition(poses[first], way, means[first], misfits[first], known[first], metre, rivals)
     elsewhere = found.elsewhere
     if not elsewhere.any():
@@ -160,8 +151,8 @@ def undisputed(found: PassagePosition, match: PreparedScan, query: PreparedScan,
     comparison found.
     """
     rivals = found.rivals
-    misfits, known = _misfits(match, query, pose[None])
-    metre = _metres([transform(pose, half) for half in _halves(query)] + _halves(match), found.way)
+    misfits, known = _misfits(match, query, pose[None], _halves(match, query))
+    metre = _metres(_halves(match, query), found.way, pose)
     here = found._replace(pose=pose, misfits=misfits[0], known=known[0], metre=metre)
     elsewhere = here.elsewhere
     needed = const.UNDISPUTED_SIGMAS if known.mean() > const.PASSAGE_KNOWN else 0.0
@@ -177,10 +168,8 @@ class FacedPosition(NamedTuple):
         fit: logarithm of the mean misfit of these surfaces.
         worse: how much larger it is elsewhere along the passage.
         evidence: number of points that fit here and not there, at the rival that fits most of them.
-        further: the same without the metre of the passage with most of them.
         better: (4, 4) the pose elsewhere at which they fit best, where that is better than here.
         rival_far: as in `ambiguity`, of all points; 0 while it is unknown.
-        turned: whether it is turned round to what is expected: the other end of a passage often looks the same.
     """
 
     pose: Array
@@ -188,22 +177,14 @@ class FacedPosition(NamedTuple):
     fit: float
     worse: float
     evidence: float
-    further: float
     better: Array | None
     rival_far: float = 0.0
-    turned: bool = False
 
     @property
     def lead(self) -> float:
         """How much worse the scans fit elsewhere, as a share of what a closure needs."""
-        evidence = self.further if self.turned else self.evidence
-        both = evidence + const.FACING_POINT * self.rival_far
-        return min(self.worse / const.FACING_LEAD, evidence / const.FACING_LEAST, both)
-
-    @property
-    def may_decide(self) -> bool:
-        """Whether it is, if all points fit worse elsewhere by enough."""
-        return self._replace(rival_far=np.inf, turned=False).decides
+        both = self.evidence + const.FACING_POINT * self.rival_far
+        return min(self.worse / const.FACING_LEAD, self.evidence / const.FACING_LEAST, both)
 
     @property
     def decides(self) -> bool:
@@ -214,12 +195,18 @@ class FacedPosition(NamedTuple):
         """The lead, also over other poses of the same scans."""
         return min([self.lead, *((one.fit - self.fit) / const.FACING_LEAD for one in rivals)])
 
-    def compared(self, pose: Array) -> bool:
-        """Whether a pose, up to its position along the passage, is this one: it was compared with it."""
-        return _along(self.pose, self.way, pose)
+
+Position = PassagePosition | FacedPosition
 
 
-def face_along(match: PreparedScan, query: PreparedScan, pose: Array) -> FacedPosition | None:
+def was_compared(found: Position, pose: Array) -> bool:
+    """Whether a pose (4, 4), up to its position along the passage, is that of a position: it was compared with it."""
+    moved = pose.copy()
+    moved[:3, 3] += (found.pose[:3, 3] - pose[:3, 3]) @ found.way * found.way
+    return near(moved, found.pose, const.DISTINCT_M, const.DISTINCT_RAD)
+
+
+def face_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: bool = False) -> FacedPosition | None:
     """Compare a pose along a passage with all others along it by the surfaces that face along it.
 
     Walls, floor and ceiling fit anywhere, and the pattern of the sensor lies on them in the same way anywhere. Ends,
@@ -229,19 +216,15 @@ def face_along(match: PreparedScan, query: PreparedScan, pose: Array) -> FacedPo
         match: the matched scan.
         query: the query's scan.
         pose: (4, 4) `match_T_query`.
+        turned: whether it is turned round to what is expected. The other end of a passage often looks the same: then
+            the metre with most of the evidence is none.
     """
     way = passage_way(match, query, pose)
     if way is None:
         return None
-    ours, theirs = _facing(query, pose[:3, :3].T @ way), _facing(match, way)
-    sigma_m = max(const.FACING_SIGMA_M, const.PLANE_SIGMA_M + 2 * common_blur(match, query))
+    halves = _facing(query, pose[:3, :3].T @ way), _facing(match, way)
     poses = np.concatenate([pose[None], shifted(pose, way, const.FACING_SHIFTS_M)])
-    parts = [
-        _misfits_with(scan, planes, points, at, sigma_m)
-        for scan, halves, at in ((match, ours, poses), (query, theirs, invert(poses)))
-        for planes, points in zip(scan.surfaces, halves, strict=True)
-    ]
-    misfits, known = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
+    misfits, known = _misfits(match, query, poses, halves, const.FACING_SIGMA_M)
     counts = known.sum(axis=1)
     fits = np.log(misfits.sum(axis=1) / np.maximum(counts, 1) + const.MISFIT_FLOOR)
     rivals = 1 + np.flatnonzero(counts[1:] >= max(const.FEWEST_FACING, const.PASSAGE_COMMON * counts[0]))
@@ -250,14 +233,14 @@ def face_along(match: PreparedScan, query: PreparedScan, pose: Array) -> FacedPo
     best = rivals[fits[rivals].argmin()]
     # what repeats is seen here, and there from another side: the same points have to tell both apart
     told = np.where(known[rivals] & known[0], misfits[rivals] - misfits[0], 0.0)
-    metre = _metres([transform(pose, half) for half in ours] + theirs, way)
-    further = (told.sum(axis=1) - _by_metre(told, metre).max(axis=1)).min()
+    metres = _by_metre(told, _metres(halves, way, pose))
+    evidence = metres.sum(axis=1) - (metres.max(axis=1) if turned else 0.0)
     worse, better = float(fits[best] - fits[0]), poses[best] if fits[best] < fits[0] else None
-    return FacedPosition(pose, way, float(fits[0]), worse, float(told.sum(axis=1).min()), float(further), better)
+    return FacedPosition(pose, way, float(fits[0]), worse, float(evidence.min()), better)
 
 
 def _facing(scan: PreparedScan, way: Array) -> list[Array]:
-    """Some points (N, 3) of each half of a scan, in the order of `_halves`, on planes that face along a direction."""
+    """Some points (N, 3) of each half of a scan, as in `Halves`, on planes that face along a direction (3,)."""
     found = []
     for half in reversed(scan.surfaces):
         points = half.points[half.planar & (np.abs(half.normals @ way) > const.FACING_COS)]
@@ -265,9 +248,10 @@ def _facing(scan: PreparedScan, way: Array) -> list[Array]:
     return found
 
 
-def _metres(points: list[Array], way: Array) -> NDArray[np.int64]:
-    """(N,) of each of several groups of points along a passage, from 0 on."""
-    metre = np.floor(np.concatenate(points) @ way).astype(np.int64)
+def _metres(halves: Halves, way: Array, pose: Array) -> NDArray[np.int64]:
+    """(N,) of each point of both scans along a passage, from 0 on, at a pose (4, 4) `match_T_query`."""
+    ours, theirs = halves
+    metre = np.floor(np.concatenate([*(transform(pose, half) for half in ours), *theirs]) @ way).astype(np.int64)
     return metre - metre.min(initial=0)
 
 
@@ -276,13 +260,18 @@ def _by_metre(values: Array, metre: NDArray[np.int64]) -> Array:
     return np.stack([np.bincount(metre, row) for row in values])
 
 
-def _misfits(match: PreparedScan, query: PreparedScan, poses: Array, every: int = 1) -> Misfits:
-    """Misfits of one in so many points of both scans with surfaces of the other at poses (K, 4, 4) `match_T_query`."""
-    sigma_m = const.PLANE_SIGMA_M + 2 * common_blur(match, query)
+def _misfits(
+    match: PreparedScan, query: PreparedScan, poses: Array, halves: Halves, least_m: float = const.PLANE_SIGMA_M
+) -> Misfits:
+    """Misfits of points of both scans with surfaces of the other at poses (K, 4, 4) `match_T_query`.
+
+    Their standard deviation is `least_m` at least.
+    """
+    sigma_m = max(const.PLANE_SIGMA_M + 2 * common_blur(match, query), least_m)
     parts = [
         _misfits_with(scan, planes, points, at, sigma_m)
-        for scan, other, at in ((match, query, poses), (query, match, invert(poses)))
-        for planes, points in zip(scan.surfaces, _halves(other, every), strict=True)
+        for scan, others, at in zip((match, query), halves, (poses, invert(poses)), strict=True)
+        for planes, points in zip(scan.surfaces, others, strict=True)
     ]
     misfits, known = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
     return misfits, known
@@ -311,6 +300,10 @@ def _peaks(means: Array) -> list[int]:
     return picks
 
 
-def _halves(scan: PreparedScan, every: int = 1) -> list[Array]:
-    """Some points (N, 3) of each half of a scan, the half first whose bands the first planes lie between."""
-    return [half.points[evenly(len(half.points), const.SAMPLE // 2)[::every]] for half in reversed(scan.surfaces)]
+def _halves(match: PreparedScan, query: PreparedScan, every: int = 1) -> Halves:
+    """One in so many points of a sample of each half."""
+
+    def of(scan: PreparedScan) -> list[Array]:
+        return [half.points[evenly(len(half.points), const.SAMPLE // 2)[::every]] for half in reversed(scan.surfaces)]
+
+    return of(query), of(match)

@@ -16,7 +16,15 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
-from umf_ros.verification.passages import FacedPosition, PassagePosition, face_along, locate_along, undisputed
+from umf_ros.verification.passages import (
+    FacedPosition,
+    PassagePosition,
+    Position,
+    face_along,
+    locate_along,
+    undisputed,
+    was_compared,
+)
 from umf_ros.verification.pose_search import (
     RotatedMaps,
     TemporalMemory,
@@ -29,7 +37,6 @@ from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import Alignment, align_scans, inspect
 from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, repetition
 
-Position = PassagePosition | FacedPosition
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 
 
@@ -132,7 +139,7 @@ class Verifier:
         A wrong closure must not carry itself on: every few keyframes the pose is searched as if it were unknown.
         """
         self._predicted += 1
-        if self._predicted % const.SEARCHED_EVERY == 0:
+        if self._predicted == const.SEARCHED_EVERY:
             return []
         with self._timed("refine"):
             scans = self.scans[offered[1]], self.scans[query]
@@ -183,13 +190,15 @@ class Verifier:
         passages: list[tuple[Hypothesis, Position]] = []
         for one in aligned:
             promises, earlier = self._promises(one, least), _along(one, passages)
-            if earlier and not (promises and self._replaces(one, earlier[1])):
+            found = self._look_elsewhere(one, earlier[1] if earlier else None) if promises else None
+            if earlier and (found is None or found is earlier[1]):
                 continue
             rivals = [other for other in aligned if other.candidate is one.candidate]
+            if isinstance(found, FacedPosition):  # those along the passage have been compared
+                rivals = [other for other in rivals if not was_compared(found, other.pose)]
+            elif found is not None and not found.undisputed:
+                rivals = []
             one.measurements |= runner_up(one, rivals)
-            found = self._look_elsewhere(one, earlier[1] if earlier else None) if promises else None
-            if isinstance(found, FacedPosition):  # measured anew; those along the passage have been compared
-                one.measurements |= runner_up(one, [other for other in rivals if not found.compared(other.pose)])
             if earlier:
                 passages.remove(earlier)
                 judged.remove(earlier[0])
@@ -213,45 +222,45 @@ class Verifier:
         of_pose = measure(hypothesis) | {"support": self._memory.support(query, match, hypothesis.pose)}
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
-    def _replaces(self, hypothesis: Hypothesis, found: Position) -> bool:
-        """Whether a hypothesis stands for its passage, where another before it found no position along it."""
-        if isinstance(found, FacedPosition) or found.decides:
-            return False
-        theirs, ours = hypothesis.scans
-        return self._faced(hypothesis) is not None or undisputed(found, theirs, ours, hypothesis.pose)
-
     @staticmethod
     def _faced(hypothesis: Hypothesis) -> tuple[FacedPosition, Alignment] | None:
         """The position along a passage that surfaces which face along it decide on, and the alignment there."""
         (theirs, ours), (query, match), alignment = hypothesis.scans, hypothesis.keyframes, hypothesis.alignment
         assert isinstance(alignment, Alignment)
-        found = face_along(theirs, ours, alignment.pose)
+        turned = _is_turned(query, match, alignment.pose)
+        found = face_along(theirs, ours, alignment.pose, turned)
         if found is not None and found.better is not None:
             alignment = align_scans(theirs, ours, found.better)
-            found = face_along(theirs, ours, alignment.pose)
-        if found is None or not found.may_decide:
+            found = face_along(theirs, ours, alignment.pose, turned)
+        if found is None or not found._replace(rival_far=np.inf).decides:
             return None
         rival_far = ambiguity(theirs, ours, alignment.pose, alignment.information)["rival_far"]
-        found = found._replace(rival_far=rival_far, turned=_is_turned(query, match, alignment.pose))
+        found = found._replace(rival_far=rival_far)
         return (found, alignment) if found.decides else None
 
-    def _look_elsewhere(self, hypothesis: Hypothesis, compared: Position | None) -> Position | None:
+    def _look_elsewhere(self, hypothesis: Hypothesis, earlier: Position | None) -> Position | None:
         """Compare with other poses; of scans in a passage, move to the best position along it, and return that.
 
-        `compared` is of an earlier hypothesis along the passage, which this one replaces.
+        `earlier` is that of a hypothesis before along the passage. It is returned where it stands for this one too:
+        where it decides, or this one decides no better.
         """
+        if earlier is not None and earlier.decides:
+            return earlier
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
         if (faced := self._faced(hypothesis)) is not None:
-            position, hypothesis.alignment = faced
-            hypothesis.pose = position.pose
-            self._measure(hypothesis)
+            position, alignment = faced
+            if alignment is not hypothesis.alignment:
+                hypothesis.pose, hypothesis.alignment = alignment.pose, alignment
+                self._measure(hypothesis)
             hypothesis.measurements["lead"] = position.lead  # the probability is that of a pose in a passage
             return position
-        assert not isinstance(compared, FacedPosition)
-        found = compared or locate_along(theirs, ours, hypothesis.pose)
-        if found is not None and (compared or undisputed(found, theirs, ours, hypothesis.pose)):
+        found = earlier or locate_along(theirs, ours, hypothesis.pose)
+        assert not isinstance(found, FacedPosition)  # those decide
+        if found is not None and undisputed(found, theirs, ours, hypothesis.pose):
             found = found._replace(pose=hypothesis.pose, undisputed=True)
+        elif earlier is not None:
+            return earlier
         if found is None or found.undisputed:
             hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
             return found
@@ -367,7 +376,7 @@ def _is_turned(query: Keyframe, match: Keyframe, pose: Array) -> bool:
 def _along(hypothesis: Hypothesis, passages: list[tuple[Hypothesis, Position]]) -> tuple[Hypothesis, Position] | None:
     """Return the hypothesis about the same candidate whose positions along a passage this one's pose is among."""
     same = (one for one in passages if one[0].candidate is hypothesis.candidate)
-    return next((one for one in same if one[1].compared(hypothesis.pose)), None)
+    return next((one for one in same if was_compared(one[1], hypothesis.pose)), None)
 
 
 def _compare_headings(passages: list[tuple[Hypothesis, Position]]) -> None:
