@@ -17,6 +17,12 @@ _M_PER_RAD, _M_PER_S = 0.5, 1e-4
 # m/s^2) during it, and this (rad, m)
 _JUMP, _ACCELERATION = np.array([np.deg2rad(5.0), 0.3]), np.array([np.deg2rad(300.0), 5.0])
 STEPS_BEFORE = 9
+SHORTEST_SILENCE_NS, USUAL_GAPS = 100_000_000, 3
+"""Shortest gap that is a silence; of slower inputs so many times their period."""
+LONGEST_SILENCE_S = 60.0
+"""A longer silence explains no more motion."""
+ANY_SPEED = np.array([1.0, 0.3])
+"""Speeds that any rover may have, m/s and rad/s."""
 
 
 def jump_excess(lengths: Array, seconds: ArrayLike, speeds: Array) -> Array:

@@ -19,10 +19,17 @@ from umf_ros.core.geometry import (
     propagate,
     ros_to_gtsam_covariance,
 )
-from umf_ros.core.odometry_noise import STEPS_BEFORE, OdometryNoise, jump_excess
+from umf_ros.core.odometry_noise import (
+    ANY_SPEED,
+    LONGEST_SILENCE_S,
+    SHORTEST_SILENCE_NS,
+    STEPS_BEFORE,
+    USUAL_GAPS,
+    OdometryNoise,
+    jump_excess,
+)
 from umf_ros.core.table import Table
 from umf_ros.core.trajectory import bracket, interpolated
-from umf_ros.sensors.sessions import ANY_SPEED, LONGEST_SILENCE_S, SILENCE_NS, USUAL_GAPS
 
 Stamps = NDArray[np.int64]
 Rows = NDArray[np.int64]
@@ -231,7 +238,7 @@ class OdometryChain:
             jumped = jump_excess(lengths[STEPS_BEFORE:], seconds[:, 0], before[:, :2])
             free_s = np.minimum(seconds, LONGEST_SILENCE_S)
             unseen = np.maximum(usual[:, :2], ANY_SPEED[::-1]) * free_s * np.minimum(free_s / _FREE_S, 1.0)
-            unseen[seconds[:, 0] <= np.maximum(SILENCE_NS / 1e9, USUAL_GAPS * usual[:, 2])] = 0.0
+            unseen[seconds[:, 0] <= np.maximum(SHORTEST_SILENCE_NS / 1e9, USUAL_GAPS * usual[:, 2])] = 0.0
             sigmas[STEPS_BEFORE + 1 :] = np.where(jumped > 0, jumped, np.minimum(unseen, [np.pi, np.inf]))
         sigmas[: start - first + 1] = 0.0  # known before
         return sigmas[start - first :]

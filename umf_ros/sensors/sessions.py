@@ -11,6 +11,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from umf_ros.core.geometry import Array, rotation_angle
+from umf_ros.core.odometry_noise import ANY_SPEED, LONGEST_SILENCE_S, SHORTEST_SILENCE_NS, USUAL_GAPS
 
 Input = Literal["left", "right", "cloud", "odometry", "camera_info"]
 ODOMETRY: Input = "odometry"
@@ -23,18 +24,11 @@ AGREEMENT_NS = 5_000_000_000
 CONFIRMING = 4
 """Messages of one input that have to go on from each other, out of line, before they are believed: some drivers stamp
 up to three in a row wrongly (*by hand*)."""
-SILENCE_NS = 100_000_000
-"""Shortest gap that is a silence; of slower inputs `USUAL_GAPS` times their period."""
-USUAL_GAPS = 3
 PERIODS = 9
 AHEAD_NS = 500_000_000
 """Shortest gap after which the next stamp may be ahead of time."""
 FASTEST_M_PER_S, FASTEST_RAD_PER_S = 20.0, 6.0
 LEAST_JUMP_M, LEAST_JUMP_RAD = 2.0, 0.7
-ANY_SPEED = np.array([1.0, 0.3])
-"""Speeds that any rover may have, m/s and rad/s."""
-LONGEST_SILENCE_S = 60.0
-"""A longer silence explains no more motion."""
 DROPPED = ("clock jump", "position jump")
 """Faults of messages that were held and then dropped."""
 
@@ -158,7 +152,7 @@ class SessionClock:
     def _silence_ns(self, name: Input) -> int:
         """Return the gap of an input that is a silence."""
         periods = sorted(self._periods_ns.get(name, ()))
-        return max(SILENCE_NS, USUAL_GAPS * (periods[len(periods) // 2] if periods else CLOCK_STEP_NS))
+        return max(SHORTEST_SILENCE_NS, USUAL_GAPS * (periods[len(periods) // 2] if periods else CLOCK_STEP_NS))
 
     def _believe(self, agreeing: list[Input], reset: Reset | None) -> list[StampedInput]:
         """Let held messages pass, the first of a new session if there is a reset; return what is decided."""
