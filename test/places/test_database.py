@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +146,11 @@ def test_a_duplicate_is_found_and_another_keyframe_of_its_stamp_is_not() -> None
     assert places.find_duplicate(make_keyframe(1, seed=5)) is None
     assert places.find_duplicate(make_keyframe(2, seed=2)) is None
     assert places.store.rows_at(10**9)[-1] == row and not places.store.rows_at(7)
+    without_image = replace(make_keyframe(1, seed=2), embedding=make_keyframe(1, seed=5).embedding)
+    assert places.find_duplicate(without_image) == row
+    empty = np.empty((0, 3), np.float32)
+    places.add(replace(make_keyframe(3, seed=2), points=empty))
+    assert places.find_duplicate(replace(make_keyframe(3, seed=5), points=empty)) is None
 
 
 def test_saving_copies_everything(tmp_path: Path) -> None:

@@ -125,12 +125,18 @@ class PlaceDatabase:
         return self.store[index]
 
     def find_duplicate(self, keyframe: Keyframe) -> int | None:
-        """Return the index of the same measurement, stored in an earlier replay of the recording; None without one."""
+        """Return the index of the same measurement, stored in an earlier replay of the recording; None without one.
+
+        The scan alone tells it, too: when a recording is played, the image of a scan may be lost once and not again.
+        """
         if not (rows := self.store.rows_at(keyframe.stamp_ns)):
             return None
         similarity = self.store.descriptors(np.array(rows)) @ keyframe.embedding.descriptor
         best = int(similarity.argmax())
-        return rows[best] if similarity[best] >= SAME_KEYFRAME else None
+        if similarity[best] >= SAME_KEYFRAME:
+            return rows[best]
+        has_scan = len(keyframe.points) > 0
+        return next((row for row in rows if has_scan and np.array_equal(self[row].points, keyframe.points)), None)
 
     @property
     def next_session(self) -> int:
