@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Frame, Points, ScanMotion
-from umf_ros.core.geometry import Array, expmap, invert, logmap, relative, transform
-from umf_ros.core.odometry_noise import STEPS_BEFORE, jump_excess
+from umf_ros.core.geometry import Array, expmap, invert, logmap, relative, rotation_angle, transform
+from umf_ros.core.odometry_noise import LEAST_JUMP, STEPS_BEFORE, jump_excess
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
@@ -50,7 +50,6 @@ class OdometryBuffer:
         self._poses: list[Array] = []
         self._origins: list[Array] = []
         self._odom_T_path: Array = np.eye(4)
-        self._twists: deque[Array] = deque(maxlen=STEPS_BEFORE)
 
     def add(self, stamp_ns: int, odom_T_body: Array) -> None:
         """Append a pose, later than all before."""
@@ -61,20 +60,24 @@ class OdometryBuffer:
         self._origins.append(self._odom_T_path)
         # lists are cut rarely and in bulk; bisection wants lists
         if self._stamps[0] < stamp_ns - 2 * self._length_ns:
-            old = bisect_left(self._stamps, stamp_ns - self._length_ns)
+            spare = max(len(self._stamps) - STEPS_BEFORE - 1, 0)
+            old = min(bisect_left(self._stamps, stamp_ns - self._length_ns), spare)
             del self._stamps[:old], self._poses[:old], self._origins[:old]
 
     def _without_jump(self, seconds: float, odom_T_body: Array) -> Array:
         """Return `odom_T_path` (4, 4), another one than before if a step jumps."""
         last, origin = self._poses[-1], self._odom_T_path
-        twist = logmap(relative(origin @ last, odom_T_body)[None])[0] / seconds
-        if len(self._twists) == STEPS_BEFORE:
-            speeds = np.linalg.norm(np.reshape([*self._twists, twist], (-1, 2, 3)), axis=2).T
-            if jump_excess(speeds[:, -1] * seconds, seconds, speeds[:, :-1]).any():
-                twist = self._twists[-1]
-                origin = odom_T_body @ invert(last @ expmap(twist[None] * seconds)[0])
-        self._twists.append(twist)
-        return origin
+        moved = relative(origin @ last, odom_T_body)
+        lengths = np.array([rotation_angle(moved), math.hypot(*moved[:3, 3])])
+        if (lengths <= LEAST_JUMP).all() or len(self._poses) <= STEPS_BEFORE:
+            return origin
+        before = np.array(self._poses[-STEPS_BEFORE - 1 :])
+        twists = logmap(invert(before[:-1]) @ before[1:])
+        twists /= np.diff(self._stamps[-STEPS_BEFORE - 1 :])[:, None] * 1e-9
+        speeds = np.linalg.norm(twists.reshape(-1, 2, 3), axis=2).T
+        if not jump_excess(lengths, seconds, speeds).any():
+            return origin
+        return odom_T_body @ invert(last @ expmap(twists[-1:] * seconds)[0])
 
     def passed(self, stamp_ns: int) -> bool:
         """Return whether the odometry has reached a stamp."""
@@ -99,7 +102,7 @@ class OdometryBuffer:
 
     def clear(self) -> None:
         """Delete all poses."""
-        for held in (self._stamps, self._poses, self._origins, self._twists):
+        for held in (self._stamps, self._poses, self._origins):
             held.clear()
         self._odom_T_path = np.eye(4)
 
