@@ -6,6 +6,7 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
+from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, cubes, transform
 
@@ -18,6 +19,11 @@ def cell_means(points: Array, values: Array, cell_m: float, range_m: float) -> A
     near, values = points[inside].astype(float), values[inside].astype(float)
     _, owner, count = np.unique(cubes(near, cell_m), return_inverse=True, return_counts=True)
     return np.column_stack([np.bincount(owner, column) / count for column in values.T]).astype(np.float32)
+
+
+def deskew(points: Array, times: Array, moments: Array, motions: Array) -> Array:
+    each = np.stack([np.interp(times, moments, column) for column in motions.T], axis=1)
+    return Rotation.from_rotvec(each[:, :3]).apply(points) + each[:, 3:]
 
 
 def oriented(points: Array, neighbours: int) -> small_gicp.PointCloud:

@@ -53,6 +53,23 @@ def scan() -> Array:
 POSE = make_pose(Rotation.from_euler("zyx", [0.2, 0.02, -0.01]).as_matrix(), [0.4, -0.2, 0.05])
 
 
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_points_are_moved_by_the_motion_of_their_time(count: int) -> None:
+    rng = np.random.default_rng(count)
+    points = rng.normal(0, 20, (5000, 3)).astype(np.float32)
+    moments = np.sort(rng.uniform(0, 1e8, count))
+    motions = rng.normal(0, 0.3, (count, 6))
+    motions[0, :3] = 0.0
+    times = np.concatenate([rng.uniform(-1e7, 1.1e8, 5000 - count), moments])
+    found = kernels.deskew(points, times, moments, motions)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, oracle.deskew(points, times, moments, motions), atol=2e-5)
+    with pytest.raises(ValueError, match="a time for every point"):
+        kernels.deskew(points, times[1:], moments, motions)
+    with pytest.raises(ValueError, match="at least one"):
+        kernels.deskew(points, times, moments[:0], motions[:0])
+
+
 def test_cells_have_the_means_of_their_points() -> None:
     rng = np.random.default_rng(2)
     points = rng.normal(0, 20, (30_000, 3)).astype(np.float32)

@@ -94,6 +94,8 @@ _DAMAGE = (McapError, struct.error, ZstdError, ValueError, RuntimeError, EOFErro
 
 SORTING_WINDOW_NS = 1_000_000_000
 """Without an index, messages are sorted within this window of time."""
+_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
+"""Opcode and length of a record; channel, sequence number, log time and publish time of a message."""
 MOST_WAITING, EACH = 2**27, 500
 """Most bytes of messages in the reorder buffer, and those of a message besides its data; a second has some dozens of
 megabytes."""
@@ -180,10 +182,10 @@ class McapFile:
                     continue
                 stream.seek(index.chunk_start_offset + 9)  # after opcode and length
                 chunk = Chunk.read(ReadDataStream(BytesIO(stream.read(index.chunk_length))))
-                for record in _unpacked(chunk):
+                for record in _unpacked(chunk, wanted):
                     number += 1
                     check_count(number, size)
-                    if isinstance(record, Message) and record.channel_id in wanted:
+                    if isinstance(record, Message):
                         topic, kind = wanted[record.channel_id]
                         message = _message(topic, record.log_time, kind, record.data)
                         yield index.message_start_time, (index.chunk_start_offset, number), message
@@ -239,22 +241,28 @@ def _message(topic: str, log_ns: int, kind: str, data: bytes) -> RawMessage:
     return RawMessage(topic, log_ns, kind, unpack("zstd", data) if data[:4] == _ZSTD else data)
 
 
-def _unpacked(chunk: Chunk) -> Iterator[McapRecord]:
-    """Yield the records of a chunk; raise a `ValueError` if it unpacks to too much."""
+def _unpacked(chunk: Chunk, wanted: Collection[int] | None = None) -> Iterator[McapRecord | None]:
+    """Yield the records of a chunk, None in place of messages of other channels than the `wanted`, if any are named.
+
+    Raises:
+        ValueError: it unpacks to too much, or a record is cut off.
+    """
     check_size(chunk.uncompressed_size, "a chunk")
-    content = unpack(chunk.compression, chunk.data)
-    stream = ReadDataStream(BytesIO(content))
-    while stream.count < len(content):
-        kind, length = stream.read1(), stream.read8()
-        match kind:
-            case Opcode.MESSAGE:
-                yield Message.read(stream, length)
-            case Opcode.CHANNEL:
-                yield Channel.read(stream)
-            case Opcode.SCHEMA:
-                yield Schema.read(stream)
-            case _:
-                stream.read(length)
+    content, begin = unpack(chunk.compression, chunk.data), 0
+    while begin < len(content):
+        kind, length = _RECORD.unpack_from(content, begin)
+        begin, end = begin + _RECORD.size, begin + _RECORD.size + length
+        if end > len(content):
+            raise ValueError("a record is cut off")
+        if kind == Opcode.MESSAGE:
+            channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content, begin)
+            is_wanted = wanted is None or channel in wanted
+            data = content[begin + _MESSAGE.size : end] if is_wanted else b""
+            yield Message(channel, log_ns, data, publish_ns, sequence) if is_wanted else None
+        elif kind in (Opcode.CHANNEL, Opcode.SCHEMA):
+            stream = ReadDataStream(BytesIO(content[begin:end]))
+            yield Channel.read(stream) if kind == Opcode.CHANNEL else Schema.read(stream)
+        begin = end
 
 
 _LIMITED: dict[Any, Any] = {bz2.decompress: partial(unpack, "bz2"), lz4.frame.decompress: partial(unpack, "lz4")}

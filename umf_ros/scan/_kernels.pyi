@@ -100,3 +100,9 @@ def align(
 
 def cell_means(points: Floats, values: Floats, cell_m: float, range_m: float) -> Floats:
     """Return means (M, C) of values (N, C) over points (N, 3) nearer than `range_m` in every occupied cube, sorted."""
+
+def deskew(points: Floats, times: Array, moments: Array, motions: Array) -> Floats:
+    """Return points (N, 3), each turned and moved by the motion at its time (N,).
+
+    Motions (K, 6), rotation vectors and shifts, are interpolated between their rising moments (K,), and held outside.
+    """

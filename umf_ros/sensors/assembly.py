@@ -18,6 +18,7 @@ from umf_ros.core.frames import Frame, Points, ScanMotion
 from umf_ros.core.geometry import Array, expmap, invert, logmap, relative, rotation_angle, transform
 from umf_ros.core.odometry_noise import LEAST_JUMP, STEPS_BEFORE, jump_excess
 from umf_ros.core.trajectory import Trajectory
+from umf_ros.scan import _kernels
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import Cloud
 from umf_ros.sensors.point_times import LONGEST_SWEEP_NS
@@ -398,5 +399,4 @@ def deskew(points: Points, point_stamps_ns: NDArray[np.int64], path: Trajectory,
     times = (path.stamps_ns - path.stamps_ns[0]).astype(float)
     at = (point_stamps_ns - path.stamps_ns[0]).astype(float)
     motion = np.hstack([turns, moved[:, :3, 3]])
-    each = np.stack([np.interp(at, times, column) for column in motion.T], axis=1)
-    return np.asarray(Rotation.from_rotvec(each[:, :3]).apply(points) + each[:, 3:], np.float32)
+    return _kernels.deskew(points, at, times, motion)

@@ -8,6 +8,7 @@
 
 #include "align.hpp"
 #include "cell_means.hpp"
+#include "deskew.hpp"
 #include "neighbourhood.hpp"
 #include "free_space.hpp"
 
@@ -201,6 +202,19 @@ nb::object means(const In<float, nb::shape<-1, 3>>& points, const In<float, nb::
   return nb::cast(copy.of({columns ? found.size() / columns : 0, columns}));
 }
 
+nb::object deskew_points(const In<float, nb::shape<-1, 3>>& points, const Values& times, const Values& moments,
+                         const In<double, nb::shape<-1, 6>>& motions) {
+  require(points.shape(0) == times.shape(0), "a time for every point");
+  require(moments.shape(0) > 0 && moments.shape(0) == motions.shape(0), "a motion for every moment, at least one");
+  const size_t count = points.shape(0);
+  Out<float> found(3 * count);
+  {
+    nb::gil_scoped_release free;
+    deskew(points.data(), times.data(), count, moments.data(), motions.data(), moments.shape(0), found.data);
+  }
+  return nb::cast(found.of({count, 3}));
+}
+
 }  // namespace
 
 NB_MODULE(_kernels, module) {
@@ -235,4 +249,5 @@ NB_MODULE(_kernels, module) {
   module.def("align", &align_points, "tree"_a, "normals"_a, "points"_a, "own_normals"_a, "guess"_a, "reach_m"_a,
              "steps"_a, "least_m"_a, "least_rad"_a);
   module.def("cell_means", &means, "points"_a, "values"_a, "cell_m"_a, "range_m"_a);
+  module.def("deskew", &deskew_points, "points"_a, "times"_a, "moments"_a, "motions"_a);
 }
