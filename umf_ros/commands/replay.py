@@ -121,10 +121,12 @@ def command(
             finish_folder(folder)
         if viewer:
             viewer.finish(folder)
+        sensors = detector.sensors.report(read_odometry_of(folder))
         remember_recording(
             folder,
             recording,
             inputs=input_counts(reader.counters),
+            sensors=sensors.as_json(),
             warnings=warnings,
             interrupted=bool(interrupted()),
             odometry_file={"path": str(odometry.resolve()), "frame": odometry_frame} if odometry else None,
@@ -135,7 +137,6 @@ def command(
             from umf_ros.runs.report import finish_run  # Matplotlib delays a start
 
             truth = truth or (read_ground_truth(recording) if interrupted() else reader.ground_truth)
-            sensors = detector.sensors.report(read_odometry_of(folder))
             run = read_run(folder, recording, truth)
             status = finish_run(run, recording, console, sensors, frozenset(warnings + absent)).exit_code
     replay.raise_if_frames_failed()

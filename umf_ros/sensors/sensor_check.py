@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections import deque
-from dataclasses import dataclass, field, replace
-from math import nan
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from math import isnan, nan
+from typing import Any, NamedTuple
 
 import numpy as np
 import small_gicp
@@ -153,6 +155,28 @@ class SensorReport:
     upwards: Array | None = None
     right_delay_s: float = 0.0
     mountings: dict[str, Array] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the measurements as `summary.json` keeps them: lists in place of arrays, without unknown ones."""
+        known = {name: value for name, value in asdict(self).items() if not (isinstance(value, float) and isnan(value))}
+        return dict(json.loads(json.dumps(known, default=np.ndarray.tolist)))
+
+    @staticmethod
+    def from_json(found: Mapping[str, Any]) -> SensorReport:
+        """Return the measurements that `as_json` gave.
+
+        Raises:
+            TypeError: they are no such measurements.
+        """
+        known = _with_arrays(found)
+        for name, kind in (("overlay", Overlay), ("lidar", Disagreement), ("camera", Disagreement)):
+            if known.get(name) is not None:
+                known[name] = kind(**_with_arrays(known[name]))
+        return SensorReport(**known | {"mountings": _with_arrays(known.get("mountings", {}))})
+
+
+def _with_arrays(entries: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: np.array(value) if isinstance(value, list) else value for name, value in entries.items()}
 
 
 SENSORS = {"lidar": "LiDAR", "camera": "camera"}

@@ -121,6 +121,16 @@ def test_closures_are_judged_by_the_truth_of_the_recording(run: Path, bag: Path)
     assert "2 true and 1 false loop closures" in ended.text and f"Report: {run}/report.html" in ended.out
 
 
+def test_sensors_that_the_replay_checked_are_not_checked_again(run: Path, bag: Path) -> None:
+    path = run / "summary.json"
+    summary = json.loads(path.read_text())
+    path.write_text(json.dumps(summary | {"sensors": {"left_contrast": 5.0}}))
+    report(run, bag)
+    assert "the left images have little contrast" in (run / "report.html").read_text(encoding="utf-8")
+    path.write_text(json.dumps(summary | {"sensors": {"contrast": 2.0}}))
+    assert f"{path} is damaged" in only_line(umf("report", run, bag))
+
+
 def test_the_page_shows_every_closure_with_pictures_scans_and_errors(run: Path, bag: Path) -> None:
     report(run, bag)
     scene = scene_of(run)

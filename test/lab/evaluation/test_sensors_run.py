@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import only_line, umf
 from finished_runs import closure, examined, stamp, trajectory
@@ -13,7 +14,7 @@ from finished_runs import closure, examined, stamp, trajectory
 from umf_ros.core.errors import UmfError
 from umf_ros.lab.evaluation.sensors_run import Stretch, describe_sensors, score, stretches_of, table_of
 from umf_ros.sensors.motion_check import Disagreement
-from umf_ros.sensors.sensor_check import SensorReport
+from umf_ros.sensors.sensor_check import Overlay, SensorReport
 
 EARLY, LATE = Stretch("early", stamp(40), stamp(59.5)), Stretch("late", stamp(59.6), stamp(80))
 
@@ -44,6 +45,16 @@ def test_what_was_not_measured_is_not_called_right() -> None:
     late = replace(seen, lidar=Disagreement(0.5, None))
     told, *rest = describe_sensors(late)
     assert "the LiDAR's clock" in told and rest == [unknown]
+
+
+def test_the_measurements_of_a_run_are_kept_in_its_summary() -> None:
+    lidar = Disagreement(None, np.array([1.0, -2.0, 0.5]), mirrored=None, impossible=True)
+    overlay = Overlay(np.array([0.1, 0.2, 0.3]), 1.01, 0.002, np.array([0.2, 0.01, 0.003]))
+    mountings = {"lidar": np.eye(3)}
+    for one in (SensorReport(), SensorReport(20.0, overlay=overlay, lidar=lidar, mountings=mountings)):
+        again = SensorReport.from_json(json.loads(json.dumps(one.as_json(), allow_nan=False)))
+        np.testing.assert_equal(asdict(again), asdict(one))
+        assert describe_sensors(again) == describe_sensors(one)
 
 
 def test_one_recording_is_replayed_with_both_sensors_and_with_each(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from umf_ros.commands.recordings import TruthPath, check_files
-from umf_ros.core.errors import UmfError
+from umf_ros.core.errors import UmfError, reading
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -49,7 +49,7 @@ def command(
 def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | None = None) -> RunVerdict:
     """Evaluate a run, write its report and return the verdict.
 
-    The recording is read again for the ground truth and the sensor check.
+    The recording is read again for the ground truth and, of a node's run, for the sensor check.
 
     Raises:
         UmfError: the run was made on another recording; nothing is written.
@@ -58,8 +58,13 @@ def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | No
     from umf_ros.lab.evaluation.inspection import check_sensors
     from umf_ros.runs.reader import read_run
     from umf_ros.runs.report import finish_run
+    from umf_ros.sensors.sensor_check import SensorReport
 
     run = read_run(folder, bag, read_ground_truth(bag, ground_truth))
+    if known := run.summary.get("sensors"):
+        with reading(folder / "summary.json", UmfError, "is damaged"):
+            sensors = SensorReport.from_json(known)
+        return finish_run(run, bag, console, sensors)
     named, odometry = run.summary.get("odometry_file"), None
     if named and Path(named["path"]).is_file():
         odometry = read_odometry(named["path"], named["frame"], run.settings)
