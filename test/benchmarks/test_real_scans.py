@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from conftest import make_keyframe
 from measurements import GOOD
+from scipy.spatial.transform import Rotation
 from support.real_pairs import RealPair, cropped, draw_pairs, read_pairs, summary
 
 from umf_ros.core.frames import Candidate, LoopClosure
@@ -77,3 +78,15 @@ def test_true_false_and_misplaced_closures_are_told_apart():
     }
     assert figures["error_median_m"] == pytest.approx(0)
     assert figures["inside_95"] == 1
+
+
+@pytest.mark.parametrize(("off_m", "inside"), [(0.0, 1.0), (0.3, 1.0), (1.0, 0.0)])
+def test_closures_are_compared_among_themselves(off_m, inside):
+    turned = make_pose(Rotation.from_euler("z", 70, degrees=True).as_matrix(), [2.0, 1.0, 0.0])
+    there = {"ab": turned, "bc": turned, "ac": turned @ turned @ make_pose(np.eye(3), [off_m, 0, 0])}
+
+    def verdict(pose):
+        return Hypothesis(2, Candidate(0, 1, 0.5), GOOD, closure=LoopClosure(2, 1, pose, np.eye(6) * 0.01))
+
+    figures = summary([(RealPair(*name, True, pose), verdict(pose)) for name, pose in there.items()])
+    assert (figures["triangles"], figures["triangles_inside_95"]) == (1, inside)

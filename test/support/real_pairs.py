@@ -5,18 +5,29 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from rich.progress import track
 
 from umf_ros.core.frames import Keyframe
-from umf_ros.core.geometry import Array, from_quaternion
+from umf_ros.core.geometry import (
+    Array,
+    adjoint,
+    from_quaternion,
+    invert,
+    logmap,
+    propagate,
+    ros_to_gtsam_covariance,
+)
 from umf_ros.lab.fit.acceptance import inside_ellipsoid
 from umf_ros.lab.simulation.domains.pairs import error_vector, is_wrong
 from umf_ros.sensors.decode import Cloud
 from umf_ros.verification import Hypothesis
 
+INSIDE_95 = 12.59
+"""95 % of squared Mahalanobis distances in six dimensions are below."""
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -89,7 +100,26 @@ def summary(verdicts: list[tuple[RealPair, Hypothesis]]) -> dict[str, float]:
         "false_accepted": sum(not pair.same_place for pair, _ in accepted),
         "error_median_m": float(np.median(np.linalg.norm(np.array(errors)[:, :3], axis=1))) if errors else nan,
         "inside_95": inside_ellipsoid(np.array(errors), np.array(covariances)) if errors else nan,
-    }
+    } | among_themselves(right)
+
+
+def among_themselves(verdicts: list[tuple[RealPair, Hypothesis]]) -> dict[str, float]:
+    """How many triangles right closures form, and the share of those that close within their 95 % ellipsoid.
+
+    No reference is needed: the third closure was measured apart from the two that lead to the same scan.
+    """
+    known = {(pair.match, pair.query): verdict.closure for pair, verdict in verdicts if verdict.closure is not None}
+    pose = {key: closure.match_T_query for key, closure in known.items()}
+    noise = {key: ros_to_gtsam_covariance(closure.covariance, pose[key]) for key, closure in known.items()}
+    distances = []
+    for (first, middle), (other, last) in product(known, known):
+        if middle == other and (first, last) in known:
+            left = logmap((invert(pose[first, last]) @ pose[first, middle] @ pose[middle, last])[None])[0]
+            carried = propagate(adjoint(invert(pose[middle, last])), noise[first, middle])
+            spread = carried + noise[middle, last] + noise[first, last]
+            distances.append(float(left @ np.linalg.solve(spread, left)))
+    inside = float(np.mean(np.array(distances) <= INSIDE_95)) if distances else float("nan")
+    return {"triangles": len(distances), "triangles_inside_95": inside}
 
 
 def is_misplaced(pair: RealPair, verdict: Hypothesis) -> bool:
