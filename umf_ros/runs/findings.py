@@ -11,11 +11,15 @@ from typing import Literal
 import numpy as np
 
 from umf_ros.bags.inputs import SEVERITIES, Advice, Severity, absent_inputs, useless_inputs
+from umf_ros.bags.reader import Bag
 from umf_ros.core.config import Settings
+from umf_ros.core.errors import UmfError
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, explain
+from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import read_absolute_verdicts
-from umf_ros.runs.truth import JudgedRun, in_words
+from umf_ros.runs.truth import JudgedRun, in_words, judge_run
+from umf_ros.runs.writer import write_summary
 from umf_ros.sensors.sensor_check import SENSORS, Overlay, SensorReport, describe_turn, find_contradictions
 
 REFUSED = (
@@ -76,6 +80,23 @@ def about_truth(about: JudgedRun) -> Iterator[Advice]:
     elif known < WELL_COVERED * total:
         what = f"the ground truth covers {known} of {total} keyframes ({spans[0]} against {spans[1]})"
         yield Advice("warning", what, "closures outside are not judged")
+
+
+def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> JudgedRun:
+    """Judge the run by the truth, if there is one; `keep` writes the `ground_truth` entry into its summary.
+
+    A truth that covers no part of a run that was judged before raises an `UmfError`.
+    """
+    judged = judge_run(run, bag)
+    if run.truth is not None:
+        covered, total = judged.covered
+        if not covered and total and run.summary["ground_truth"]:
+            fault = next(about_truth(judged)).what
+            raise UmfError(f"{fault}; {run.folder} was judged before; nothing was written")
+        run.summary["ground_truth"] = judged.summary() if covered or not total else None
+    if keep:
+        write_summary(run.folder, run.summary)
+    return judged
 
 
 def _pairs(about: JudgedRun) -> Iterator[Advice]:

@@ -24,12 +24,11 @@ from rich.table import Table as Grid
 
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.reader import Bag
-from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Image, LoopClosure
 from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import write_atomically
 from umf_ros.pose_graph.closures import State
-from umf_ros.runs.findings import RunVerdict, about_truth, conclude, look_first
+from umf_ros.runs.findings import RunVerdict, conclude, judge, look_first
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import Endpoints, read_inliers
 from umf_ros.runs.scene import (
@@ -43,8 +42,7 @@ from umf_ros.runs.scene import (
     read_pictures,
     size_of,
 )
-from umf_ros.runs.truth import MEDIAN_EXPECTED, Judged, JudgedRun, in_words, judge_run
-from umf_ros.runs.writer import write_summary
+from umf_ros.runs.truth import MEDIAN_EXPECTED, Judged, JudgedRun, in_words
 from umf_ros.sensors.sensor_check import SensorReport
 
 
@@ -298,23 +296,6 @@ def finish_run(
         write_page(about, verdict, findings, build_scene(about, pairs, pictures, inliers, heights))
     print_summary(console, about, verdict, findings, printed)
     return verdict
-
-
-def judge(run: FinishedRun, bag: Bag | None = None, keep: bool = True) -> JudgedRun:
-    """Judge the run by the truth, if there is one; `keep` writes the `ground_truth` entry into its summary.
-
-    A truth that covers no part of a run that was judged before raises an `UmfError`.
-    """
-    judged = judge_run(run, bag)
-    if run.truth is not None:
-        covered, total = judged.covered
-        if not covered and total and run.summary["ground_truth"]:
-            fault = next(about_truth(judged)).what
-            raise UmfError(f"{fault}; {run.folder} was judged before; nothing was written")
-        run.summary["ground_truth"] = judged.summary() if covered or not total else None
-    if keep:
-        write_summary(run.folder, run.summary)
-    return judged
 
 
 def draw_trajectory(about: JudgedRun) -> None:

@@ -90,8 +90,8 @@ def why(
     from umf_ros.bags.reader import open_bag
     from umf_ros.bags.trajectories import read_ground_truth
     from umf_ros.runs.diagnosis import explain
+    from umf_ros.runs.findings import judge
     from umf_ros.runs.reader import read_run
-    from umf_ros.runs.report import judge
     from umf_ros.runs.writer import read_summary
 
     recover_run(folder)
@@ -169,10 +169,7 @@ def recover_run(folder: Path) -> bool:
     from contextlib import closing
 
     from umf_ros.core.config import load_settings
-    from umf_ros.durable_graph import feed
-    from umf_ros.pose_graph.backend import PoseGraph
     from umf_ros.runs.run_file import NAME, RunFile
-    from umf_ros.runs.writer import RunRecorder, write_summary
 
     if not (folder / NAME).is_file() or not (folder / "config.yaml").is_file():
         return False
@@ -181,6 +178,11 @@ def recover_run(folder: Path) -> bool:
         if facts.get("exported") and (folder / "summary.json").is_file():
             return False
         settings, inputs = load_settings(folder / "config.yaml"), list(file.graph_inputs())
+
+    from umf_ros.durable_graph import feed
+    from umf_ros.pose_graph.backend import PoseGraph
+    from umf_ros.runs.writer import RunRecorder, write_summary
+
     recorder = RunRecorder(folder, settings, str(facts.get("weights", "")))
     write_summary(folder, recorder.summary({}) | {"interrupted": True})
     recorder.close()

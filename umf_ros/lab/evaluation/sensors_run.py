@@ -22,9 +22,9 @@ from umf_ros.core.tasks import spread
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.evaluation.results import TextTable
 from umf_ros.replay import Replay
-from umf_ros.runs.findings import about_sensors
+from umf_ros.runs.findings import about_sensors, judge
 from umf_ros.runs.reader import read_run, remember_recording
-from umf_ros.runs.report import finish_run, judge
+from umf_ros.runs.report import finish_run
 from umf_ros.runs.run_file import read_odometry_of
 from umf_ros.runs.truth import JudgedRun
 from umf_ros.runs.writer import count_drops
