@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 UMF = (sys.executable, "-m", "umf_ros.cli")
 LIMIT_S = 1200.0
+SEED, SECONDS = 27001, 46
+"""Of the drive that most cases change."""
 
 
 class Outcome(NamedTuple):
@@ -77,3 +79,12 @@ def says(text: str, status: int | None = None) -> Check:
 def umf(folder: Path, *arguments: str) -> None:
     """Run a command of `umf` in a folder, for the making of an input."""
     subprocess.run([*UMF, *arguments], cwd=folder, capture_output=True, check=True)
+
+
+def simulated(folder: Path) -> Path:
+    """Return the drive as simulated, made once in a folder."""
+    path = folder / "demo.mcap"
+    if not path.exists():
+        umf(folder, "simulate", "making.mcap", "--preset", "demo", "--seed", str(SEED), "--duration", str(SECONDS))
+        (folder / "making.mcap").rename(path)
+    return path

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dialect_case import Case, Check, Outcome, umf
+from dialect_case import Case, Check, Outcome, simulated
 from mcap.writer import CompressionType, Writer
 from zstandard import ZstdCompressor
 
@@ -19,7 +19,6 @@ from umf_ros.core.geometry import Array, to_quaternion
 from umf_ros.core.resources import find
 from umf_ros.sensors.calibration import load_calibration
 
-SEED, SECONDS = 27001, 46
 TOPICS = {
     "/stereo/left/image_rect": "/camera/left/image_rect",
     "/stereo/left/camera_info": "/camera/left/camera_info",
@@ -77,8 +76,7 @@ def base(folder: Path) -> Path:
     path = folder.parent / "base.mcap"
     if path.exists():
         return path
-    demo = folder.parent / "demo.mcap"
-    umf(folder.parent, "simulate", str(demo), "--preset", "demo", "--seed", str(SEED), "--duration", str(SECONDS))
+    demo = simulated(folder.parent)
     with recording(path.with_suffix(".part")) as out:
         for number, raw in enumerate(open_bag(demo).raw_messages(TOPICS)):
             if not number:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from dialect_case import Case, Check, Outcome, says, umf
+from dialect_case import Case, Check, Outcome, says, simulated, umf
 from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.reader import open_bag
@@ -17,7 +17,6 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
 from umf_ros.core.trajectory import Trajectory, write_tum
 
-SEED, SECONDS = "27001", "46"
 START_NS, COUNT = 1_625_644_800_000_000_000, 300
 
 
@@ -112,9 +111,7 @@ def _reading(name: str, text: Sequence[str], said: str, encoding: str = "utf-8",
 
 def _run_with(change: Callable[[Trajectory], Trajectory], folder: Path) -> None:
     """Copy a run of the drive, made once, beside a truth that is changed."""
-    drive, known = folder.parent / "demo.mcap", folder.parent / "judged_run"
-    if not drive.exists():
-        umf(folder.parent, "simulate", str(drive), "--preset", "demo", "--seed", SEED, "--duration", SECONDS)
+    drive, known = simulated(folder.parent), folder.parent / "judged_run"
     if not known.exists():
         umf(folder.parent, "replay", str(drive), "--out", "judged_runs")
         shutil.copytree((folder.parent / "judged_runs" / "latest").resolve(), known)
