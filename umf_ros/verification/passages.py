@@ -19,7 +19,15 @@ from umf_ros.core.geometry import Array, evenly, invert, near, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur
 from umf_ros.verification.scan_alignment import run_gicp
-from umf_ros.verification.scan_consistency import mean_misfits, near_identity, patterned, shifted
+from umf_ros.verification.scan_consistency import (
+    largest_walls,
+    mean_misfits,
+    near_identity,
+    off_walls,
+    patterned,
+    shifted,
+    upright_sample,
+)
 
 Halves = tuple[list[Array], list[Array]]
 """Points (N, 3) of each half of a query and of a match, the half first whose bands the first planes lie between."""
@@ -237,6 +245,56 @@ def face_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: bo
     evidence = metres.sum(axis=1) - (metres.max(axis=1) if turned else 0.0)
     worse, better = float(fits[best] - fits[0]), poses[best] if fits[best] < fits[0] else None
     return FacedPosition(pose, way, float(fits[0]), worse, float(evidence.min()), better)
+
+
+def stands_out(match: PreparedScan, query: PreparedScan, pose: Array) -> bool:
+    """Whether what stands before the walls of a passage fits at a pose and nowhere else along it.
+
+    Ivy, plants, cars and goods are no planes: their points are compared with points, those of one half of a scan with
+    the other half of the other scan. A narrow sensor does not see them from elsewhere. There each point counts as it
+    fits on average along the passage, for that is what is known of it.
+
+    Args:
+        match: the matched scan.
+        query: the query's scan.
+        pose: (4, 4) `match_T_query`.
+    """
+    way = passage_way(match, query, pose)
+    if way is None:
+        return False
+    halves = _standing(query), _standing(match)
+    poses = np.concatenate([pose[None], shifted(pose, way, const.STANDING_SHIFTS_M)])
+    misfits = np.concatenate(
+        [
+            scan.free_space.point_misfits(half.tree, points, np.full(len(points), const.STANDING_M), at, 1.0)
+            for scan, others, at in zip((match, query), halves, (poses, invert(poses)), strict=True)
+            for half, points in zip(scan.surfaces, others, strict=True)
+        ],
+        axis=1,
+    )
+    misfits = misfits[:, np.isfinite(misfits[0])].astype(float)
+    known, here = np.isfinite(misfits[1:]), misfits[0]
+    if not known.any():
+        return False
+    there = np.where(known, misfits[1:], 0.0)
+    usual = (there.sum(axis=0) + there.sum() / known.sum()) / (known.sum(axis=0) + 1)
+    worse = np.where(known, there, usual) - here
+    leads = np.log1p(worse.mean(axis=1) / (here.mean() + const.MISFIT_FLOOR))
+    return bool(leads.min() >= const.STANDING_LEAD and worse.sum(axis=1).min() >= const.STANDING_POINTS)
+
+
+def _standing(scan: PreparedScan) -> list[Array]:
+    """Some points (N, 3) of each half of a scan, as in `Halves`, that are off its walls and its ground."""
+    walls, found = largest_walls(*upright_sample(scan)), []
+    height = scan.points @ scan.up[2]
+    ground_m = np.quantile(height, const.GROUND_SHARE) + const.STANDING_M
+    for half in reversed(scan.surfaces):
+        level = half.planar & (np.abs(half.normals @ scan.up[2]) > const.LEVEL_COS)
+        near = half.reach_m < const.STANDING_REACH_M
+        stands = near & ~level & off_walls(half.points, walls, 2 * const.WALL_M) & (half.points @ scan.up[2] > ground_m)
+        points = half.points[stands]
+        found.append(np.ascontiguousarray(points[evenly(len(points), const.STANDING_SAMPLE)]))
+    return found
 
 
 def _facing(scan: PreparedScan, way: Array) -> list[Array]:

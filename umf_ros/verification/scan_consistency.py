@@ -160,17 +160,36 @@ def _beyond_walls(scan: PreparedScan, other: PreparedScan, other_T_scan: Array) 
     points, normals = scan.sample[seen], scan.sample_normals[seen]
     if len(points) < const.FEWEST_POINTS:
         return np.nan
+    left = off_walls(points, largest_walls(points, normals))
+    return float(left.mean())
+
+
+def upright_sample(scan: PreparedScan) -> tuple[Array, Array]:
+    """Points (N, 3) of a scan's sample on surfaces steeper than 45 deg, and their normals (N, 3)."""
+    chosen = _upright(scan, scan.sample_normals)
+    return scan.sample[chosen], scan.sample_normals[chosen]
+
+
+def largest_walls(points: Array, normals: Array) -> Array:
+    """(W, 4) unit normals and offsets, m, of the three largest planes, at most, of points (N, 3) with normals (N, 3)."""
     ways, through = normals[:: const.SCOUT_EVERY], points[:: const.SCOUT_EVERY]
-    offsets, left = np.einsum("ij,ij->i", through, ways), points
+    offsets, left, walls = np.einsum("ij,ij->i", through, ways), points, np.empty((0, 4))
     for _ in range(const.WALLS):
         near = np.abs(left @ ways.T - offsets) < const.WALL_M
-        wall = left[near[:, near.sum(axis=0).argmax()]]
+        wall = left[near[:, near.sum(axis=0).argmax()]] if len(left) else left
         if len(wall) < const.NEIGHBOURS:
             break
         centre = wall.mean(axis=0)
         way = np.linalg.svd(wall - centre, full_matrices=False)[2][2]
-        left = left[np.abs((left - centre) @ way) >= const.WALL_M]
-    return len(left) / len(points)
+        walls = np.vstack([walls, [*way, way @ centre]])
+        left = left[off_walls(left, walls[-1:])]
+    return walls
+
+
+def off_walls(points: Array, walls: Array, least_m: float = const.WALL_M) -> Mask:
+    """(N,) whether points (N, 3) are this far from every one of (W, 4) planes."""
+    away: Mask = (np.abs(points @ walls[:, :3].T - walls[:, 3]) >= least_m).all(axis=1)
+    return away
 
 
 def _mean_point_misfit(match: PreparedScan, query: PreparedScan, poses: Array, standing: bool = False) -> Array:

@@ -22,6 +22,7 @@ from umf_ros.verification.passages import (
     Position,
     face_along,
     locate_along,
+    stands_out,
     undisputed,
     was_compared,
 )
@@ -257,8 +258,9 @@ class Verifier:
             return position
         found = earlier or locate_along(theirs, ours, hypothesis.pose)
         assert not isinstance(found, FacedPosition)  # those decide
-        if found is not None and undisputed(found, theirs, ours, hypothesis.pose):
-            found = found._replace(pose=hypothesis.pose, undisputed=True)
+        pose = hypothesis.pose
+        if found is not None and (undisputed(found, theirs, ours, pose) or stands_out(theirs, ours, pose)):
+            found = found._replace(pose=pose, undisputed=True)
         elif earlier is not None:
             return earlier
         if found is None or found.undisputed:
