@@ -139,7 +139,7 @@ STANDING_M, STANDING_REACH_M, STANDING_SAMPLE, LEVEL_COS, GROUND_SHARE = 0.25, 1
 STANDING_SHIFTS_M = np.setdiff1d(np.arange(-60, 61), np.arange(-2, 3)) * 0.25  # geometry: as far as scans overlap
 # log of the ratio of misfits, and points that fit here alone. measured on validation seeds: before facades with ivy 70 of
 # 73 right poses have that, of 66 wrong ones of corridors, tunnels and rows of piers none has a lead above 0
-STANDING_LEAD, STANDING_POINTS = 0.08, 15.0
+STANDING_LEAD, STANDING_POINTS, STANDING_WORSE = 0.08, 15.0, 0.03
 PASSAGE_SAME_M = 0.1  # measured: alignments that end so near each other count once; .25 m moves verdicts
 # standard deviations by which all rivals fit worse than a pose that other measurements found, where more than this
 # share of points is known; elsewhere, as outdoors, none may fit better. measured: of 43 right poses of a real corridor

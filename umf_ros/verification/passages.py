@@ -247,8 +247,30 @@ def face_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: bo
     return FacedPosition(pose, way, float(fits[0]), worse, float(evidence.min()), better)
 
 
-def stands_out(match: PreparedScan, query: PreparedScan, pose: Array) -> bool:
-    """Whether what stands before the walls of a passage fits at a pose and nowhere else along it.
+class StandingEvidence(NamedTuple):
+    """Whether what stands before the walls of a passage fits at a pose better than elsewhere along it.
+
+    Attributes:
+        lead: log of the ratio of its misfits, at the rival that fits best.
+        points: number of points that fit here alone.
+    """
+
+    lead: float
+    points: float
+
+    @property
+    def supports(self) -> bool:
+        """Whether it fits at the pose alone."""
+        return self.lead >= const.STANDING_LEAD and self.points >= const.STANDING_POINTS
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether it fits better elsewhere."""
+        return self.lead < -const.STANDING_WORSE
+
+
+def stand_out(match: PreparedScan, query: PreparedScan, pose: Array) -> StandingEvidence:
+    """Compare a pose along a passage with all others along it by what stands before the walls.
 
     Ivy, plants, cars and goods are no planes: their points are compared with points, those of one half of a scan with
     the other half of the other scan. A narrow sensor does not see them from elsewhere. There each point counts as it
@@ -259,9 +281,10 @@ def stands_out(match: PreparedScan, query: PreparedScan, pose: Array) -> bool:
         query: the query's scan.
         pose: (4, 4) `match_T_query`.
     """
+    unknown = StandingEvidence(0.0, 0.0)
     way = passage_way(match, query, pose)
     if way is None:
-        return False
+        return unknown
     halves = _standing(query), _standing(match)
     poses = np.concatenate([pose[None], shifted(pose, way, const.STANDING_SHIFTS_M)])
     misfits = np.concatenate(
@@ -275,12 +298,12 @@ def stands_out(match: PreparedScan, query: PreparedScan, pose: Array) -> bool:
     misfits = misfits[:, np.isfinite(misfits[0])].astype(float)
     known, here = np.isfinite(misfits[1:]), misfits[0]
     if not known.any():
-        return False
+        return unknown
     there = np.where(known, misfits[1:], 0.0)
     usual = (there.sum(axis=0) + there.sum() / known.sum()) / (known.sum(axis=0) + 1)
     worse = np.where(known, there, usual) - here
     leads = np.log1p(worse.mean(axis=1) / (here.mean() + const.MISFIT_FLOOR))
-    return bool(leads.min() >= const.STANDING_LEAD and worse.sum(axis=1).min() >= const.STANDING_POINTS)
+    return StandingEvidence(float(leads.min()), float(worse.sum(axis=1).min()))
 
 
 def _standing(scan: PreparedScan) -> list[Array]:

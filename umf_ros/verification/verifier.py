@@ -22,7 +22,7 @@ from umf_ros.verification.passages import (
     Position,
     face_along,
     locate_along,
-    stands_out,
+    stand_out,
     undisputed,
     was_compared,
 )
@@ -259,7 +259,7 @@ class Verifier:
         found = earlier or locate_along(theirs, ours, hypothesis.pose)
         assert not isinstance(found, FacedPosition)  # those decide
         pose = hypothesis.pose
-        if found is not None and (undisputed(found, theirs, ours, pose) or stands_out(theirs, ours, pose)):
+        if found is not None and self._stays(found, hypothesis):
             found = found._replace(pose=pose, undisputed=True)
         elif earlier is not None:
             return earlier
@@ -270,6 +270,16 @@ class Verifier:
         self._measure(hypothesis)
         hypothesis.measurements["lead"] = found.lead
         return found
+
+    @staticmethod
+    def _stays(found: PassagePosition, hypothesis: Hypothesis) -> bool:
+        """Whether the pose of a hypothesis holds against all others along a passage."""
+        (theirs, ours), (query, match), pose = hypothesis.scans, hypothesis.keyframes, hypothesis.pose
+        standing = stand_out(theirs, ours, pose)
+        # rows of goods look alike from either end
+        if standing.supports and not _is_turned(query, match, pose):
+            return True
+        return not standing.contradicts and undisputed(found, theirs, ours, pose)
 
     @staticmethod
     def _commonplace(hypothesis: Hypothesis) -> dict[str, float]:
