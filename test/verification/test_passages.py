@@ -14,8 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Embedding, Keyframe
-from umf_ros.core.geometry import Array, make_pose
+from umf_ros.core.geometry import Array, make_pose, relative
 from umf_ros.lab.simulation.domains.passages import PASSAGES, drive
+from umf_ros.lab.simulation.domains.scanners import SCANNERS, sweep
+from umf_ros.lab.simulation.domains.solids import Solids
 from umf_ros.lab.simulation.scenes import BODY_T_CAMERA, CAMERA
 from umf_ros.submaps.history import submap_around
 from umf_ros.verification import Hypothesis, RejectReason, Verifier, verifier
@@ -28,6 +30,7 @@ from umf_ros.verification.passages import (
     _peaks,
     face_along,
     locate_along,
+    stand_out,
     undisputed,
     was_compared,
 )
@@ -399,6 +402,51 @@ def test_a_person_who_walked_on_is_no_evidence_of_a_position(seed: int) -> None:
     )
     verdict = verdict_of(match, query, shift(seen[0] - seen[1]))
     assert verdict.closure is None or abs(verdict.pose[0, 3] - x) < 0.3
+
+
+def facade(ivy: bool) -> list[tuple[Keyframe, Array]]:
+    """Keyframes of a Cube-1 that stood at three places before a bare front, and where; with ivy before it or not."""
+    solids, rng = Solids(), np.random.default_rng(3)
+    solids.box([8.5, 0, -1], [1, 60, 14])
+    solids.box([0, 0, -1.1], [60, 60, 1.0])
+    for place in ([7.0, -2.0, 1.0], [7.4, 1.5, 2.0], [6.5, 3.0, 1.5]) if ivy else ():
+        solids.leaves(rng.normal(0, 0.7, (150, 3)) + place, 0.2, rng)
+    scene, seen = solids.scene(), []
+    for number, (shift_m, yaw) in enumerate(((0.0, 0.0), (0.6, 0.15), (-0.5, -0.2))):
+        pose = make_pose(Rotation.from_euler("z", yaw).as_matrix(), [0.3 * shift_m, shift_m, 0.9])
+        swept = sweep(SCANNERS["cube1"], scene, lambda _, pose=pose: pose, rng)
+        embedding, points = Embedding(np.ones(1, np.float32)), thin_scan(swept.points)
+        seen.append((Keyframe((number + 1) * 10**9, embedding, CAMERA, BODY_T_CAMERA, points), pose))
+    return seen
+
+
+def test_ivy_before_a_front_tells_where_along_it_a_narrow_sensor_stood() -> None:
+    (first, world_T_first), *others = facade(ivy=True)
+    for second, world_T_second in others:
+        true = relative(world_T_first, world_T_second)
+        found = Verifier(Verification(min_probability=0.5)).verify(second, [(Candidate(0, 10**9, 0.9), first)])[0]
+        assert found.closure is not None, found.outcome
+        assert np.linalg.norm(found.pose[:3, 3] - true[:3, 3]) < 0.1
+        scans = PreparedScan.of(first), PreparedScan.of(second)
+        assert stand_out(*scans, true).supports
+        for metres in (-3.0, -1.5, 1.5, 3.0):
+            along = make_pose(np.eye(3), [0.0, metres, 0.0]) @ true
+            assert not stand_out(*scans, along).supports and stand_out(*scans, along).contradicts
+
+
+def test_a_front_without_anything_before_it_tells_no_position() -> None:
+    (first, world_T_first), (second, world_T_second), _ = facade(ivy=False)
+    true = relative(world_T_first, world_T_second)
+    assert not stand_out(PreparedScan.of(first), PreparedScan.of(second), true).supports
+    found = Verifier(Verification(min_probability=0.5)).verify(second, [(Candidate(0, 10**9, 0.9), first)])[0]
+    assert found.closure is None
+
+
+def test_what_stands_before_walls_tells_no_heading(monkeypatch: pytest.MonkeyPatch) -> None:
+    (first, _), (second, _), _ = facade(ivy=True)
+    offered = [(Candidate(0, 10**9, 0.9), first)]
+    monkeypatch.setattr(verifier, "_is_turned", lambda *_: True)
+    assert Verifier(Verification(min_probability=0.5)).verify(second, offered)[0].closure is None
 
 
 def person_ranges(ways: Array, ahead_m: float, radius: float) -> Array:

@@ -171,7 +171,7 @@ def upright_sample(scan: PreparedScan) -> tuple[Array, Array]:
 
 
 def largest_walls(points: Array, normals: Array) -> Array:
-    """(W, 4) unit normals and offsets, m, of the three largest planes, at most, of points (N, 3) with normals (N, 3)."""
+    """(W, 4) unit normals and offsets, m, of the three largest planes at most of points (N, 3) with normals (N, 3)."""
     ways, through = normals[:: const.SCOUT_EVERY], points[:: const.SCOUT_EVERY]
     offsets, left, walls = np.einsum("ij,ij->i", through, ways), points, np.empty((0, 4))
     for _ in range(const.WALLS):
@@ -188,8 +188,7 @@ def largest_walls(points: Array, normals: Array) -> Array:
 
 def off_walls(points: Array, walls: Array, least_m: float = const.WALL_M) -> Mask:
     """(N,) whether points (N, 3) are this far from every one of (W, 4) planes."""
-    away: Mask = (np.abs(points @ walls[:, :3].T - walls[:, 3]) >= least_m).all(axis=1)
-    return away
+    return np.asarray((np.abs(points @ walls[:, :3].T - walls[:, 3]) >= least_m).all(axis=1))
 
 
 def _mean_point_misfit(match: PreparedScan, query: PreparedScan, poses: Array, standing: bool = False) -> Array:
