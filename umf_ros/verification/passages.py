@@ -10,12 +10,14 @@ planes (`locate_along`) where those do not.
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from umf_ros.core.geometry import Array, evenly, invert, near, transform
+from umf_ros.core.geometry import Array, evenly, invert, make_pose, near, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur
 from umf_ros.verification.scan_alignment import run_gicp
@@ -253,15 +255,18 @@ class StandingEvidence(NamedTuple):
     Attributes:
         lead: log of the ratio of its misfits, at the rival that fits best.
         points: number of points that fit here alone.
+        tilt_lead: the same over the pose tilted to either side of the passage.
     """
 
     lead: float
     points: float
+    tilt_lead: float
 
     @property
     def supports(self) -> bool:
         """Whether it fits at the pose alone."""
-        return self.lead >= const.STANDING_LEAD and self.points >= const.STANDING_POINTS
+        decides = self.lead >= const.STANDING_LEAD and self.points >= const.STANDING_POINTS
+        return decides and self.tilt_lead >= const.TILT_LEAD
 
     @property
     def contradicts(self) -> bool:
@@ -274,19 +279,23 @@ def stand_out(match: PreparedScan, query: PreparedScan, pose: Array) -> Standing
 
     Ivy, plants, cars and goods are no planes: their points are compared with points, those of one half of a scan with
     the other half of the other scan. A narrow sensor does not see them from elsewhere. There each point counts as it
-    fits on average along the passage, for that is what is known of it.
+    fits on average along the passage, for that is what is known of it. A wall leaves open how far two scans are tilted
+    against each other in its plane, too.
 
     Args:
         match: the matched scan.
         query: the query's scan.
         pose: (4, 4) `match_T_query`.
     """
-    unknown = StandingEvidence(0.0, 0.0)
     way = passage_way(match, query, pose)
-    if way is None:
-        return unknown
     halves = _standing(query), _standing(match)
-    poses = np.concatenate([pose[None], shifted(pose, way, const.STANDING_SHIFTS_M)])
+    if way is None or not all(map(len, chain(*halves))):
+        return StandingEvidence(0.0, 0.0, 0.0)
+    middle = np.concatenate([*(transform(pose, half) for half in halves[0]), *halves[1]]).mean(axis=0)
+    across = np.cross(match.up[2], way)
+    turns = Rotation.from_rotvec(const.TILTS_RAD[:, None] * across / np.linalg.norm(across)).as_matrix()
+    tilted = [make_pose(turn, middle - turn @ middle) @ pose for turn in turns]
+    poses = np.concatenate([pose[None], tilted, shifted(pose, way, const.STANDING_SHIFTS_M)])
     misfits = np.concatenate(
         [
             scan.free_space.point_misfits(half.tree, points, np.full(len(points), const.STANDING_M), at, 1.0)
@@ -296,14 +305,16 @@ def stand_out(match: PreparedScan, query: PreparedScan, pose: Array) -> Standing
         axis=1,
     )
     misfits = misfits[:, np.isfinite(misfits[0])].astype(float)
-    known, here = np.isfinite(misfits[1:]), misfits[0]
-    if not known.any():
-        return unknown
-    there = np.where(known, misfits[1:], 0.0)
-    usual = (there.sum(axis=0) + there.sum() / known.sum()) / (known.sum(axis=0) + 1)
-    worse = np.where(known, there, usual) - here
-    leads = np.log1p(worse.mean(axis=1) / (here.mean() + const.MISFIT_FLOOR))
-    return StandingEvidence(float(leads.min()), float(worse.sum(axis=1).min()))
+    known = np.isfinite(misfits)
+    there = np.where(known, misfits, 0.0)
+    along = slice(1 + len(tilted), None)
+    if not known[along].any():
+        return StandingEvidence(0.0, 0.0, 0.0)
+    usual = (there[along].sum(axis=0) + there[along].sum() / known[along].sum()) / (known[along].sum(axis=0) + 1)
+    worse = np.where(known, there, usual) - there[0]
+    leads = np.log1p(worse.mean(axis=1) / (there[0].mean() + const.MISFIT_FLOOR))
+    tilt_lead = float(leads[1 : along.start].min())
+    return StandingEvidence(float(leads[along].min()), float(worse[along].sum(axis=1).min()), tilt_lead)
 
 
 def _standing(scan: PreparedScan) -> list[Array]:
