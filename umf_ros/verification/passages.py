@@ -10,6 +10,7 @@ planes (`locate_along`) where those do not.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import chain
 from typing import NamedTuple
 
@@ -299,8 +300,7 @@ def stand_out(match: PreparedScan, query: PreparedScan, pose: Array) -> Standing
     misfits = np.concatenate(
         [
             scan.free_space.point_misfits(half.tree, points, np.full(len(points), const.STANDING_M), at, 1.0)
-            for scan, others, at in zip((match, query), halves, (poses, invert(poses)), strict=True)
-            for half, points in zip(scan.surfaces, others, strict=True)
+            for scan, half, points, at in _opposite(match, query, poses, halves)
         ],
         axis=1,
     )
@@ -362,11 +362,19 @@ def _misfits(
     sigma_m = max(const.PLANE_SIGMA_M + 2 * common_blur(match, query), least_m)
     parts = [
         _misfits_with(scan, planes, points, at, sigma_m)
-        for scan, others, at in zip((match, query), halves, (poses, invert(poses)), strict=True)
-        for planes, points in zip(scan.surfaces, others, strict=True)
+        for scan, planes, points, at in _opposite(match, query, poses, halves)
     ]
     misfits, known = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
     return misfits, known
+
+
+def _opposite(
+    match: PreparedScan, query: PreparedScan, poses: Array, halves: Halves
+) -> Iterator[tuple[PreparedScan, Surfaces, Array, Array]]:
+    """Yield both scans, each of their halves, the other scan's points (N, 3) for it, and their poses (K, 4, 4)."""
+    for scan, others, at in zip((match, query), halves, (poses, invert(poses)), strict=True):
+        for half, points in zip(scan.surfaces, others, strict=True):
+            yield scan, half, points, at
 
 
 def _misfits_with(scan: PreparedScan, planes: Surfaces, points: Array, poses: Array, sigma_m: float) -> Misfits:
