@@ -117,8 +117,8 @@ def cloud_of(records: np.ndarray, like: Any, after_ns: int = 0) -> Any:
     )
 
 
-def timed(name: str, kind: str, times: Callable[[np.ndarray, int], Any]) -> Change:
-    """Times of points under a name, in a type, as made of ns after the stamp and the stamp."""
+def timed(name: str, kind: str, times: Callable[[np.ndarray, int], Any], later_ns: int = 0) -> Change:
+    """Times of points under a name, in a type, as made of ns after the stamp and the stamp; a scan stamped later."""
 
     def change(topic: str, message: Any) -> Iterator[tuple[int, Any]]:
         if topic == CLOUD:
@@ -127,7 +127,7 @@ def timed(name: str, kind: str, times: Callable[[np.ndarray, int], Any]) -> Chan
             for axis in ("x", "y", "z", "intensity"):
                 after[axis] = before[axis]
             after[name] = times(before["point_time_offset"].astype(np.int64), stamp_of(message))
-            message = cloud_of(after, message)
+            message = cloud_of(after, message, later_ns)
         yield 0, message
 
     return change
@@ -249,8 +249,10 @@ def _case(name: str, change: Change, text: str = "") -> Case:
     return Case(name, partial(rewrite, change), REPLAY, expected, closures(text))
 
 
-def _times(name: str, field: str, kind: str, times: Callable[[np.ndarray, int], Any], text: str = "") -> Case:
-    return _case(f"07 {name}", timed(field, kind, times), text)
+def _times(
+    name: str, field: str, kind: str, times: Callable[[np.ndarray, int], Any], text: str = "", later_ns: int = 0
+) -> Case:
+    return _case(f"07 {name}", timed(field, kind, times, later_ns), text)
 
 
 def _fisheye(folder: Path) -> str:
@@ -291,6 +293,7 @@ def _below_a_pixel(outcome: Outcome) -> tuple[bool, str]:
     return float(outcome.said.split()[0]) < 1, outcome.said
 
 
+SWEEP_NS = 200_000_000
 ALONE = "the left camera is used alone"
 CASES: list[Case] = [
     _case("19 plain", unchanged),
@@ -300,7 +303,7 @@ CASES: list[Case] = [
     _times("us_u4", "t", "<u4", lambda offsets, stamp: offsets // 1000),
     _times("ms_f4", "time", "<f4", lambda offsets, stamp: offsets * 1e-6),
     _times("us_f8", "time_stamp", "<f8", lambda offsets, stamp: offsets * 1e-3),
-    _times("end_u4", "ts", "<u4", lambda offsets, stamp: (offsets - 2 * 10**8) % 2**32),
+    _times("end_u4", "ts", "<u4", lambda offsets, stamp: (offsets - SWEEP_NS) % 2**32, later_ns=SWEEP_NS),
     _times("ptp", "timestamp", "<f8", lambda offsets, stamp: (stamp + offsets) * 1e-9 + 37),
     _times("s_epoch_f4", "timestamp", "<f4", lambda offsets, stamp: (stamp + offsets) * 1e-9, "too coarse"),
     _times("constant", "time", "<f4", lambda offsets, stamp: 0 * offsets, "are all equal"),

@@ -220,8 +220,8 @@ class ScanLimits:
             self._warn(text)
 
 
-FEW, DECIDING = 100, 6
-"""Returns of a message by which it can be recognised as a part, and messages that decide (*by hand*)."""
+FEW, ALIKE, DECIDING = 100, 3, 6
+"""Returns of a message by which it can be recognised as a part; least and most messages that decide (*by hand*)."""
 APART, ANEW = 0.3, 0.6
 """Overlap of directions below which two messages are parts, and about which one begins a scan (*by hand*)."""
 FASTEST_NS, PACKETS_NS, GAP = 20_000_000, 100_000_000, 3
@@ -239,8 +239,8 @@ class WholeScan(NamedTuple):
 class ScanJoiner:
     """Joins the parts of scans, for drivers that publish sectors, bands or packets of a rotation.
 
-    The first messages decide whether there is anything to join: successive parts of a scan look in different
-    directions, packets follow each other faster than any LiDAR rotates. Each part keeps its own stamp.
+    The first messages wait until they tell whether there is anything to join: successive parts of a scan look in
+    different directions, packets follow each other faster than any LiDAR rotates. Each part keeps its own stamp.
     """
 
     def __init__(self) -> None:
@@ -250,31 +250,49 @@ class ScanJoiner:
 
     def add(self, stamp_ns: int, cloud: Cloud) -> list[WholeScan]:
         """Take the next message; return the scans that are known to be whole by now."""
-        if self._kind == "whole" or (not self._kind and len(cloud.points) < FEW):
+        if self._kind == "whole":
             return [WholeScan(stamp_ns, cloud)]
+        if not self._kind:
+            if len(cloud.points) < FEW:
+                return [*self.flush(), WholeScan(stamp_ns, cloud)]
+            self._parts.append((stamp_ns, cloud, _directions(cloud)))
+            return self._decide()
         part = stamp_ns, cloud, _directions(cloud)
-        undecided = not self._kind
-        done = self.flush() if not undecided and self._parts and self._begins(stamp_ns, part[2]) else []
+        done = self.flush() if self._parts and self._begins(stamp_ns, part[2]) else []
         self._parts.append(part)
-        if undecided:
-            self._decide()
-        return [WholeScan(stamp_ns, cloud)] if undecided else done
+        return done
 
     def flush(self) -> list[WholeScan]:
-        """Return the scan whose parts wait, at the end of a session."""
-        parts, self._parts = self._parts if self._kind else [], []
-        return [_join(parts)] if parts else []
+        """Return what waits, at the end of a session: the parts of a scan, or the first scans one by one."""
+        parts, self._parts = self._parts, []
+        if self._kind in ("parts", "packets"):
+            return [_join(parts)] if parts else []
+        return [WholeScan(stamp_ns, cloud) for stamp_ns, cloud, _ in parts]
 
-    def _decide(self) -> None:
-        """Decide by the first messages, which were used one by one."""
-        if len(self._parts) < DECIDING:
-            return
+    @property
+    def first_ns(self) -> int | None:
+        """Stamp of the first message that waits."""
+        return self._parts[0][0] if self._parts else None
+
+    def _decide(self) -> list[WholeScan]:
+        """Decide by the first messages, if they suffice, and return the scans that they make."""
         stamps, _, seen = zip(*self._parts, strict=True)
-        self._period_ns, self._parts = int(np.median(np.diff(stamps))), []
-        if min(_overlap(one, other) for one, other in combinations(seen, 2)) < APART:
+        if len(stamps) < ALIKE:
+            return []
+        self._period_ns = int(np.median(np.diff(stamps)))
+        overlaps = [_overlap(one, other) for one, other in combinations(seen, 2)]
+        if min(overlaps) < APART:
             self._kind = "parts"
-        else:
+        elif min(overlaps) > ANEW and self._period_ns >= FASTEST_NS:
+            self._kind = "whole"
+        elif len(stamps) == DECIDING:
             self._kind = "packets" if self._period_ns < FASTEST_NS else "whole"
+        if not self._kind:
+            return []
+        if self._kind == "whole":
+            return self.flush()
+        waiting, self._parts = self._parts, []
+        return [scan for stamp_ns, cloud, _ in waiting for scan in self.add(stamp_ns, cloud)]
 
     def _begins(self, stamp_ns: int, seen: Mask) -> bool:
         """Return whether a message begins a new scan."""

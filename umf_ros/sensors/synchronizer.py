@@ -244,7 +244,8 @@ class Synchronizer:
             self._forget_before(anchor.stamp_ns)  # the scans to come are later than this one
         now_ns = self._sensed_ns
         if now_ns is not None:
-            self._forget_before(now_ns - self._max_wait_ns)
+            waiting_ns = self._joiner.first_ns
+            self._forget_before(min(now_ns - self._max_wait_ns, now_ns if waiting_ns is None else waiting_ns))
 
     @property
     def _sensed_ns(self) -> int | None:
