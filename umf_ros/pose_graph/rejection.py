@@ -205,11 +205,11 @@ class OutlierRejection:
         """
         rows = sorted(rows)
         self._again.difference_update(rows)
-        agreed, accepted = self._gate(rows), self._of(State.ACCEPTED)
+        agreed, accepted = self._agreeing(rows), self._of(State.ACCEPTED)
         opposed = any(self._consistency.opponents(row, accepted) for row in agreed)
         if self._is_outdated and (opposed or len(agreed) < (~accepted & ~self._revoked)[rows].sum()):
             self.solve(rough=True)
-            agreed = self._gate(rows)
+            agreed = self._agreeing(rows)
         supported = [member for found in self._supported_sets(rows, self._of(State.PENDING)) for member in found]
         supported += self._overrule(rows)
         reasons = dict.fromkeys(supported, ClosureReason.SUPPORTED) | dict.fromkeys(agreed, ClosureReason.AGREES)
@@ -217,6 +217,15 @@ class OutlierRejection:
         if not reasons:
             reasons = dict.fromkeys(self._unopposed(), ClosureReason.UNOPPOSED)
         return self._accept(reasons)
+
+    def _agreeing(self, rows: Iterable[int]) -> list[int]:
+        """Compare closures with the map; returns those whose consistency with it suffices, and that are unrivalled."""
+        agreed = self._gate(rows)
+        if not self.settings.reject_outliers:
+            return agreed
+        pending = self._of(State.PENDING) & np.array(self._joined, bool)
+        places = {row: [row, *self._consistency.companions(row, pending)] for row in agreed}
+        return [row for row, place in places.items() if not self._is_outnumbered([row], place, pending)]
 
     def _take(self, placed: PlacedClosure) -> int:
         row = len(self.placed)
@@ -382,12 +391,16 @@ class OutlierRejection:
             odds = self._odds_against(place, at_last)
             usual = [row for row, odd in zip(place, odds, strict=True) if waiting[row] and odd <= most_odds]
             usual = [row for row in usual if not self._consistency.opponents(row, against)]
-            likely = pending & (ratios < _RIVAL_RATIO * np.median(ratios[place]))
-            rivals = {rival for row in usual for rival in self._consistency.opponents(row, likely)}
-            outnumbered = any(len(self._consistency.companions(rival, pending)) + 1 >= len(place) for rival in rivals)
-            if usual and not outnumbered and np.median(odds) <= most_odds:
+            if usual and np.median(odds) <= most_odds and not self._is_outnumbered(usual, place, pending):
                 best, most_odds = usual, float(np.median(odds))
         return best
+
+    def _is_outnumbered(self, rows: list[int], place: list[int], pending: NDArray[np.bool_]) -> bool:
+        """Return whether a likely place among pending closures, with as many of them as a place, opposes some of it."""
+        ratios = np.array(self._ratios)
+        likely = pending & (ratios < _RIVAL_RATIO * np.median(ratios[place]))
+        rivals = {rival for row in rows for rival in self._consistency.opponents(row, likely)}
+        return any(len(self._consistency.companions(rival, pending)) + 1 >= len(place) for rival in rivals)
 
     def _odds_against(self, place: list[int], at_last: bool) -> Array:
         """Return (N,) odds that closures of one place are wrong, by the map and, at the end, by all other evidence."""
