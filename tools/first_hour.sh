@@ -143,8 +143,6 @@ refused later train "$T/folder" --out "$T/train"
 refused later train "$T/folder" --method nonsense
 refused later train "$T/folder" --preset nonsense --out "$T/train"
 refused later train "$T/folder" --resume --out "$T/train"
-refused later pretrain image "$T/nowhere"
-refused now pretrain sound "$T/folder"
 refused later export "$T/notes.txt/model.xml"
 refused later export "$T/model.xml" --weights "$T/notes.txt"
 # evaluation

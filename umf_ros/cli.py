@@ -35,7 +35,6 @@ COMMANDS = {
     "export": "umf_ros.lab.commands.train:export",
     "bench": "umf_ros.lab.commands.bench:app",
     "doctor": "umf_ros.commands.doctor",
-    "pretrain": "umf_ros.lab.commands.train:app",
     "graph": "umf_ros.lab.commands.graph:app",
     "places": "umf_ros.commands.stores:places",
     "fleet": "umf_ros.commands.stores:fleet",

@@ -22,7 +22,6 @@ GROUPS = {
     "graph": ["optimize", "plot"],
     "map": ["make", "edit", "grow", "export"],
     "places": ["list", "delete"],
-    "pretrain": ["image", "lidar"],
 }
 COMMANDS = [name for name in cli.COMMANDS if name not in GROUPS]
 
@@ -71,7 +70,7 @@ def test_every_command_explains_itself_and_its_options(words: list[str]) -> None
     assert umf(*words, "-h").out == ended.out
 
 
-@pytest.mark.parametrize("words", [["replay"], ["evaluate"], ["map", "make"], ["pretrain", "image"]])
+@pytest.mark.parametrize("words", [["replay"], ["evaluate"], ["map", "make"]])
 def test_paragraphs_of_the_help_fill_their_lines(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     prose = umf(*words, "--help").out.partition("╭")[0].splitlines()

@@ -13,13 +13,12 @@ from typer.testing import CliRunner
 
 from umf_ros.core.config import dump_settings
 from umf_ros.core.errors import ConfigError, UmfError
-from umf_ros.lab.commands import evaluate, train
+from umf_ros.lab.commands import evaluate
 from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
 
 app = typer.Typer()
 app.command("evaluate")(evaluate.command)
-app.add_typer(train.app, name="pretrain")
 
 
 def run(*arguments: str) -> str:
@@ -110,10 +109,3 @@ def test_a_recording_without_truth_is_refused(tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "a.mcap", [entry for entry in traverse(1) if entry[0] not in (TRUTH, ODOMETRY)])
     with pytest.raises(ConfigError, match="--ground-truth"):
         run("evaluate", str(bag), "--out", str(tmp_path))
-
-
-def test_pretraining_says_what_is_wrong(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="mask_ratio"):
-        run("pretrain", "image", str(tmp_path), "--mask-ratio", "1.2")
-    with pytest.raises(ConfigError, match="no worlds"):
-        run("pretrain", "lidar", str(tmp_path), "--out", str(tmp_path / "run"))

@@ -285,7 +285,6 @@ def test_every_modality_is_lost_now_and_then_and_never_both(folder, tmp_path, mo
 
 app = typer.Typer()
 app.command("train")(train_command.command)
-app.add_typer(train_command.app, name="pretrain")
 
 
 def umf(*arguments: object) -> str:
@@ -317,28 +316,13 @@ def test_training_from_the_command_line(folder, tmp_path, monkeypatch):
     assert [row["step"] for row in csv.DictReader((out / "log.csv").open())] == ["1", "2"]
 
 
-def test_pretraining_from_the_command_line(folder, tmp_path):
-    options = ["--preset", "tiny", "--steps", 1, "--batch", 2, "--threads", 1]
-    image = umf("pretrain", "image", folder, "--out", tmp_path / "image", "--mask-ratio", 0.5, *options)
-    assert "tiny_image.safetensors" in image.replace("\n", "")
-    assert read_card(tmp_path / "image" / "tiny_image.safetensors")["settings"]["mask_ratio"] == 0.5
-    (tmp_path / "wide.yaml").write_text("ring_ratios: [0.9, 0.2, 0.1]\nsteps: 7\n")
-    config = ["--config", tmp_path / "wide.yaml"]
-    lidar = umf("pretrain", "lidar", folder, "--out", tmp_path / "lidar", *config, *options)
-    settings = load_run(tmp_path / "lidar" / "training.yaml")
-    assert settings.ring_ratios == (0.9, 0.2, 0.1) and settings.steps == 1
-    assert "tiny_lidar.safetensors" in lidar.replace("\n", "")
-    assert len(list((tmp_path / "lidar").glob("reconstructions_*.png"))) == 1
-
-
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
         (["train", "nowhere", "--preset", "tiny"], "not a folder"),
         (["train", "nowhere", "--loss", "hinge"], "loss: "),
         (["train", "{worlds}", "--preset", "tiny", "--device", "foo"], "device: "),
-        (["pretrain", "lidar", "nowhere", "--mask-ratio", "0.5"], "mask_ratio is of images"),
-        (["pretrain", "image", "nowhere", "--steps", "0"], "steps: "),
+        (["train", "nowhere", "--steps", "0"], "steps: "),
     ],
 )
 def test_what_cannot_be_trained_is_said_in_one_line(arguments, word, folder, tmp_path):
@@ -348,11 +332,10 @@ def test_what_cannot_be_trained_is_said_in_one_line(arguments, word, folder, tmp
 
 
 def test_a_run_of_one_kind_does_not_resume_from_the_other(folder, tmp_path):
-    umf("pretrain", "image", folder, "--out", tmp_path, "--preset", "tiny", "--steps", 1, "--batch", 2)
+    options = "--out", tmp_path, "--preset", "tiny", "--steps", 1
+    umf("train", folder, *options)
     with pytest.raises(WeightsError, match="of another run"):
-        umf("train", folder, "--out", tmp_path, "--preset", "tiny", "--steps", 1, "--resume")
-    with pytest.raises(WeightsError, match="of another run"):
-        umf("pretrain", "lidar", folder, "--out", tmp_path, "--preset", "tiny", "--steps", 1, "--batch", 2, "--resume")
+        umf("train", folder, *options, "--method", "minkloc_fusion", "--resume")
 
 
 def test_a_recipe_trains_stage_by_stage_and_goes_on_where_it_was_interrupted(tmp_path):

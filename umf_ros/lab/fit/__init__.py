@@ -1,1 +1,1 @@
-"""Everything that writes a fitted file: acceptance, reranking, covariance, scene, vocabulary, and an adaptation."""
+"""Everything that writes a fitted file: acceptance, reranking, covariance, scene and vocabulary."""

@@ -139,7 +139,7 @@ class DescriptorObjective(Objective):
         if settings.loss == "triplet" and losses["active"] < settings.active_share:
             self.batch_size = min(int(self.batch_size * settings.batch_growth) // 2 * 2, settings.batch_limit)
 
-    def judge(self, step: int, folder: Path) -> Judgement:
+    def judge(self, step: int) -> Judgement:
         """Recall on the validation worlds."""
         self.settle()
         found = self.recalls()

@@ -194,7 +194,7 @@ class MetricObjective(Objective):
         if settings.loss == "triplet" and losses["active"] < settings.active_share:
             self.batch_size = min(int(self.batch_size * settings.batch_growth) // 2 * 2, settings.batch_limit)
 
-    def judge(self, step: int, folder: Path) -> Judgement:
+    def judge(self, step: int) -> Judgement:
         """Recall on the validation sequences, where a validation is due."""
         settings = self._settings
         due = step >= settings.steps or math.ceil(step / settings.epoch_steps) % settings.validate_epochs == 0

@@ -97,8 +97,6 @@ def _one_line(error: Exception) -> str:
 
 OBJECTIVES = {
     "metric": ("metric_objective", "MetricObjective"),
-    "masked_images": ("masked_objectives", "MaskedImagesObjective"),
-    "masked_scans": ("masked_objectives", "MaskedScansObjective"),
     "netvlad": ("baseline_objectives", "NetVladObjective"),
     "pointnet2": ("baseline_objectives", "DescriptorObjective"),
     "minkloc_visual": ("baseline_objectives", "DescriptorObjective"),
@@ -185,13 +183,8 @@ class Objective(nn.Module, ABC):
     def finish_epoch(self, losses: Mapping[str, float]) -> None:
         """Adapt to the mean losses of an epoch, in every process."""
 
-    def judge(self, step: int, folder: Path) -> Judgement:
-        """How the network stands after `step` steps; asked after every epoch, in the leading process alone.
-
-        Args:
-            step: steps done.
-            folder: the run's, for pictures.
-        """
+    def judge(self, step: int) -> Judgement:
+        """How the network stands after `step` steps; asked after every epoch, in the leading process alone."""
         return Judgement()
 
     def card(self) -> dict[str, Any]:

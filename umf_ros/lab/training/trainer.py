@@ -144,7 +144,7 @@ class Trainer:
             self._judge(keep)
 
     def _judge(self, keep: Callable[[], None]) -> None:
-        judgement = self._objective.judge(self.progress.step, self._folder) if self._team.leads else Judgement()
+        judgement = self._objective.judge(self.progress.step) if self._team.leads else Judgement()
         self.progress.figures |= {name: value for name, value in judgement.figures.items() if math.isfinite(value)}
         if self._team.leads and judgement.keep:
             keep()
@@ -258,7 +258,7 @@ def train(settings: RunSettings, output: Path, resume: bool, report: Callable[[P
         report: called after every step.
 
     Returns:
-        Path of the weights, `<preset>.safetensors`, with the encoder's name where one was pretrained.
+        Path of the weights, `<preset>.safetensors`, with the method's name where it is not `metric`.
 
     Raises:
         ConfigError: unknown preset, or no data that serves the objective.
