@@ -2,7 +2,7 @@
 # make test   the whole test suite
 # make test-jazzy   the suite with the versions of an installed Jazzy (NumPy 1.26.4), in a separate venv
 # make check   lint and the fast tests, about two minutes
-# make lint   ruff, mypy, codespell, the import contracts and the rules of prose
+# make lint   ruff, mypy, codespell, the import contracts, the rules of prose and the limits of structure
 # make bench   CPU per scan of a replay and its parts
 # make docs   the documentation as a site, build/site
 .PHONY: demo test check test-jazzy lint bench docs install clean
@@ -51,6 +51,7 @@ lint: install
 	@$(BIN)/lint-imports --no-logo
 	@$(BIN)/codespell
 	@$(BIN)/python tools/style_check.py
+	@$(BIN)/python tools/structure_figures.py --check
 
 bench: install
 	@$(BIN)/python benchmarks/scale/cpu.py

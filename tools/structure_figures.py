@@ -1,16 +1,22 @@
-"""Print the figures of the package's structure beside their limits, one column for each checkout.
+"""Figures of the package's structure, beside the limits of its architecture and a record that only ever falls.
 
-python tools/structure_figures.py [CHECKOUT ...]    default: this one; the newest comes last
+python tools/structure_figures.py [CHECKOUT ...]    print them, one column for each checkout; default: this one
+python tools/structure_figures.py --check           fail where a figure is above the record, as `make lint` does
+python tools/structure_figures.py --record          take lower figures into the record
 
-Lines are those of the files as `ruff format` leaves them. The runtime is the package without `lab` and `baselines`.
-Imported files are all that a module imports, directly or not, the module itself and late imports included.
+Code lines are those without blank lines, comments, docstrings and imports. The runtime is the package without `lab` and
+`baselines`. Imported files are all that a module imports, directly or not, the module itself and late imports included.
 """
 
+from __future__ import annotations
+
 import ast
+import io
 import json
 import re
 import subprocess
 import sys
+import tokenize
 from pathlib import Path
 
 import grimp
@@ -19,32 +25,25 @@ PACKAGE = "umf_ros"
 NOT_RUNTIME = ("lab", "baselines")
 RECORDS = ("Candidate", "Hypothesis", "LoopClosure", "ClosureVerdict", "ClosureDiagnosis")
 """Records that one pair of keyframes passes through; `Keyframe` is the sixth."""
-SECOND_EDITION_RECORDS = (
-    *("Candidate", "RankedCandidate", "Hypothesis", "AlignedHypothesis", "Measurement", "JudgedHypothesis", "Verdict"),
-    *("TestedCandidate", "Pair", "LoopClosure", "WaitingClosure", "TrackedClosure", "GraphVerdict", "JudgedClosure"),
-    *("Why", "ScenePair"),
-)
-ENTRY_POINTS = {
-    "detector": ("detector", "loop_detector"),
-    "live front-end": ("nodes.loop_closure_node",),
-    "back-end node": ("nodes.pose_graph_node",),
-}
-"""Modules by their names, the present one first."""
+ENTRY_POINTS = {"detector": "detector", "front-end": "nodes.loop_closure_node", "back-end": "nodes.pose_graph_node"}
+RECORD = Path(__file__).with_name("structure_record.json")
 LIMITS = {
-    "runtime: lines": 20_000,
-    "runtime: files": 130,
-    "runtime: classes": 230,
-    "verification: lines": 2_700,
-    "verification: numeric constants": 90,
-    "pose_graph: lines": 2_000,
-    "runs: lines": 2_600,
-    "sensors: lines": 2_000,
-    "places: lines": 700,
-    "embedding + networks: lines": 2_300,
-    "lab: files": 90,
-    "imported by the detector: files": 50,
-    "imported by the live front-end: files": 75,
-    "imported by the back-end node: files": 50,
+    "runtime: code lines": 11_000,
+    "runtime: files": 100,
+    "runtime: classes": 170,
+    "verification, submaps, scan: code lines": 1_500,
+    "kernels: code lines of C++": 900,
+    "verification, submaps: numeric constants": 50,
+    "files imported by the detector": 35,
+    "files imported by the front-end": 60,
+    "files imported by the back-end": 40,
+    "largest class: lines": 250,
+    "largest class: members": 20,
+    "most parameters of a function": 7,
+    "uses of private members in tests": 30,
+    "lab: lines": 18_000,
+    "benchmarks: lines": 4_000,
+    "tests: lines": 32_000,
     "records for one pair of keyframes": 6,
     "largest complexity": 10,
     "imports of the lab or the baselines by the runtime": 0,
@@ -68,25 +67,32 @@ class Checkout:
             return [path for path in self.files if _top(self.root, path) in packages]
         return [path for path in self.files if _top(self.root, path) not in NOT_RUNTIME]
 
-    def classes(self, files: list[Path]) -> int:
+    def classes_of(self, files: list[Path]) -> list[ast.ClassDef]:
         """Classes of files, also those inside others."""
-        return sum(isinstance(node, ast.ClassDef) for path in files for node in ast.walk(self.trees[path]))
+        return [node for path in files for node in ast.walk(self.trees[path]) if isinstance(node, ast.ClassDef)]
 
     def constants(self, files: list[Path]) -> int:
         """Names at the top of modules that stand for a number or for several."""
         return sum(len(_numeric_names(node)) for path in files for node in self.trees[path].body)
 
-    def imported(self, names: tuple[str, ...]) -> int:
-        """Files of the package that the first of these modules that exists imports, itself included."""
-        module = next(f"{PACKAGE}.{name}" for name in names if f"{PACKAGE}.{name}" in self.graph.modules)
-        return len(self.graph.find_upstream_modules(module)) + 1
+    def imported(self, name: str) -> int:
+        """Files of the package that a module imports, itself included."""
+        return len(self.graph.find_upstream_modules(f"{PACKAGE}.{name}")) + 1
+
+    def parameters(self, files: list[Path]) -> int:
+        """Most parameters of a function, without self and options of a command."""
+        found = 0
+        for path in files:
+            for node in ast.walk(self.trees[path]):
+                if isinstance(node, ast.FunctionDef) and not node.decorator_list and _part_of(path) != "commands":
+                    named = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+                    found = max(found, sum(one.arg not in ("self", "cls") for one in named))
+        return found
 
     def records(self) -> int:
-        """Records for one pair of keyframes: those of `RECORDS`, or of the second edition where those are there."""
-        defined = {
-            node.name for path in self.within() for node in ast.walk(self.trees[path]) if isinstance(node, ast.ClassDef)
-        }
-        return 1 + len(defined & {*RECORDS, *SECOND_EDITION_RECORDS} - {"Keyframe"})
+        """Records for one pair of keyframes."""
+        defined = {node.name for node in self.classes_of(self.within())}
+        return 1 + len(defined & set(RECORDS))
 
     def complexity(self) -> int:
         """The largest cyclomatic complexity of a function."""
@@ -106,31 +112,88 @@ class Checkout:
 
 
 def figures(checkout: Checkout) -> dict[str, int]:
-    """Figures by name, every row of the table of limits and the sizes of the other packages."""
-    runtime, verification = checkout.within(), checkout.within("verification", "submaps")
+    """Figures by name, every row of the table of limits and the sizes of the packages."""
+    runtime = checkout.within()
+    verification, geometry = checkout.within("verification", "submaps"), checkout.within("scan")
+    classes = checkout.classes_of(runtime)
+    outside = checkout.root.parent
+    tests = sorted((outside / "test").rglob("*.py"))
+    kernels = sum(cpp_lines(path.read_text(encoding="utf-8")) for path in checkout.root.rglob("*.[ch]pp"))
     found = {
-        "runtime: lines": lines(runtime),
+        "runtime: code lines": code_lines(runtime) + kernels,
         "runtime: files": len(runtime),
-        "runtime: classes": checkout.classes(runtime),
-        "verification: lines": lines(verification),
-        "verification: numeric constants": checkout.constants(verification),
-        **{f"{name}: lines": lines(checkout.within(name)) for name in ("pose_graph", "runs", "sensors", "places")},
-        "embedding + networks: lines": lines(checkout.within("embedding", "networks")),
-        "lab: files": len(checkout.within("lab")),
-        **{f"imported by the {name}: files": checkout.imported(modules) for name, modules in ENTRY_POINTS.items()},
+        "runtime: classes": len(classes),
+        "verification, submaps, scan: code lines": code_lines(verification + geometry),
+        "kernels: code lines of C++": kernels,
+        "verification, submaps: numeric constants": checkout.constants(verification),
+        **{f"files imported by the {name}": checkout.imported(module) for name, module in ENTRY_POINTS.items()},
+        "largest class: lines": max((node.end_lineno or 0) - node.lineno + 1 for node in classes),
+        "largest class: members": max(len(_members(node)) for node in classes),
+        "most parameters of a function": checkout.parameters(runtime),
+        "uses of private members in tests": sum(_private_uses(path) for path in tests),
+        "lab: lines": lines(checkout.within("lab")),
+        "benchmarks: lines": lines(sorted((outside / "benchmarks").rglob("*.py"))),
+        "tests: lines": lines(tests),
         "records for one pair of keyframes": checkout.records(),
         "largest complexity": checkout.complexity(),
         "imports of the lab or the baselines by the runtime": checkout.forbidden_imports(),
     }
-    others = ("core", "bags", "maps", "fleet", "nodes", "commands", "lab", "baselines")
-    found |= {f"{name}: lines": lines(checkout.within(name)) for name in others}
-    found["longest file: lines"] = max(lines([path]) for path in checkout.files)
-    return found
+    packages = sorted({_top(checkout.root, path) for path in runtime if path.parent != checkout.root})
+    return found | {f"{name}: code lines": code_lines(checkout.within(name)) for name in packages}
 
 
 def lines(paths: list[Path]) -> int:
     """Lines of files."""
     return sum(len(path.read_text(encoding="utf-8").splitlines()) for path in paths)
+
+
+def code_lines(paths: list[Path]) -> int:
+    """Code lines of Python files."""
+    return sum(_code_lines(path.read_text(encoding="utf-8")) for path in paths)
+
+
+def cpp_lines(text: str) -> int:
+    """Code lines of C++: without blank lines, comments and includes."""
+    text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+    return sum(bool(line.strip()) and not line.strip().startswith(("//", "#")) for line in text.splitlines())
+
+
+_SILENT = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
+
+
+def _code_lines(text: str) -> int:
+    left_out = set()
+    for node in ast.walk(ast.parse(text)):
+        is_text = (
+            isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        )
+        if is_text or isinstance(node, (ast.Import, ast.ImportFrom)):
+            left_out |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    spans = [range(token.start[0], token.end[0] + 1) for token in tokens if token.type not in _SILENT]
+    return len({number for span in spans for number in span} - left_out)
+
+
+def _members(node: ast.ClassDef) -> set[str]:
+    """Methods of a class, its fields and the attributes that it sets on itself."""
+    names = {one.name for one in node.body if isinstance(one, ast.FunctionDef)}
+    names |= {one.target.id for one in node.body if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)}
+    for one in ast.walk(node):
+        is_own = isinstance(one, ast.Attribute) and isinstance(one.value, ast.Name) and one.value.id == "self"
+        if is_own and isinstance(one.ctx, ast.Store):
+            names.add(one.attr)
+    return names
+
+
+def _private_uses(path: Path) -> int:
+    """Uses of private members of other objects, as `found._rows`."""
+    nodes = (node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Attribute))
+    private = (node for node in nodes if re.match(r"_[a-z]", node.attr) and not node.attr.startswith("_replace"))
+    return sum(not (isinstance(node.value, ast.Name) and node.value.id in ("self", "os")) for node in private)
+
+
+def _part_of(path: Path) -> str:
+    return next((part for part in path.parts if part in ("commands", "nodes")), "")
 
 
 def _top(root: Path, path: Path) -> str:
@@ -154,10 +217,32 @@ def _numeric_names(node: ast.stmt) -> list[str]:
     return [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
 
 
-if __name__ == "__main__":
-    columns = [figures(Checkout(Path(name))) for name in sys.argv[1:] or [Path(__file__).parents[1]]]
-    for name in columns[-1]:
+def above(found: dict[str, int], record: dict[str, int]) -> list[str]:
+    """A sentence for every figure that is above the record."""
+    return [f"{name}: {found[name]:,}, more than {most:,}" for name, most in record.items() if found[name] > most]
+
+
+def main(words: list[str]) -> int:
+    """Print the figures, check them against the record, or lower the record."""
+    folders = [Path(word) for word in words if not word.startswith("-")] or [Path(__file__).parents[1]]
+    columns = [figures(Checkout(folder)) for folder in folders]
+    found = columns[-1]
+    record: dict[str, int] = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
+    if "--check" in words:
+        worse = above(found, record)
+        for sentence in worse:
+            sys.stdout.write(f"tools/structure_record.json: {sentence}\n")
+        return bool(worse)
+    if "--record" in words:
+        lower = {name: min(found[name], record.get(name, found[name])) for name in LIMITS}
+        RECORD.write_text(json.dumps(lower, indent=2) + "\n", encoding="utf-8")
+    for name in found:
         limit = f"{LIMITS[name]:>8,}" if name in LIMITS else " " * 8
         values = [f"{column[name]:>8,}" for column in columns]
-        over = "  over" if name in LIMITS and columns[-1][name] > LIMITS[name] else ""
+        over = "  over" if name in LIMITS and found[name] > LIMITS[name] else ""
         sys.stdout.write(f"{name:52} {' '.join(values)} | limit {limit}{over}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

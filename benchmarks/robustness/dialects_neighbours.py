@@ -307,6 +307,6 @@ CASES = [
     _right("14 jump of 8 deg during a scan of a match", jump(0, 8, (135,))),
     _right("14 two jumps of 1 m", jump(1, 0, (400, 700))),
     _told("20 left image late", delayed((LEFT,), 1), "images"),
-    _told("20 right image two frames late", delayed((RIGHT,), 2), "images"),
+    _right("20 right image two frames late", delayed((RIGHT,), 2)),
     _told("20 both images late", delayed((LEFT, RIGHT), 2), "the camera's clock is about"),
 ]
