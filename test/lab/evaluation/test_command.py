@@ -18,6 +18,7 @@ from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
 
 app = typer.Typer()
+app.callback()(lambda: None)  # so that the name of its command is read
 app.command("evaluate")(evaluate.command)
 
 

@@ -284,6 +284,7 @@ def test_every_modality_is_lost_now_and_then_and_never_both(folder, tmp_path, mo
 
 
 app = typer.Typer()
+app.callback()(lambda: None)  # so that the name of its command is read
 app.command("train")(train_command.command)
 
 
