@@ -367,6 +367,29 @@ def test_a_joined_scan_is_deskewed_by_the_stamps_of_its_parts(calibration: Calib
         np.testing.assert_allclose(transform(frame.odom_T_body, frame.points), expected, atol=2e-3)
 
 
+@pytest.mark.parametrize("count", [2, 16])
+def test_parts_with_one_stamp_are_joined_and_a_message_twice_is_a_duplicate(
+    calibration: Calibration, count: int
+) -> None:
+    synchronizer = Synchronizer(Sync(), calibration, {"cloud"})
+    parts = [part for _, part in cut(whole_scan(), count, True, True)]
+    stream = [("cloud", T0 + scan * 200 * MS, part) for scan in range(6) for part in [*parts, parts[-1]]]
+    frames = feed(synchronizer, stream) + synchronizer.flush()
+    assert [len(frame.points) for frame in frames if frame.points is not None] == [4000] * 6
+    assert synchronizer.counters["cloud"].dropped["duplicate"] == 6
+    check_accounts(synchronizer)
+
+
+def test_of_two_whole_scans_with_one_stamp_the_first_is_used(calibration: Calibration) -> None:
+    synchronizer = Synchronizer(Sync(), calibration, {"cloud"})
+    near, far = whole_scan(), whole_scan()
+    far = Cloud(1.5 * far.points, far.intensity, far.time_offset_ns)
+    stream = [("cloud", T0 + scan * 200 * MS, cloud) for scan in range(6) for cloud in (near, far)]
+    frames = feed(synchronizer, stream) + synchronizer.flush()
+    assert len(frames) == 6 and synchronizer.counters["cloud"].dropped["duplicate"] == 6
+    check_accounts(synchronizer)
+
+
 @pytest.mark.parametrize("period_ms", [100, 200, 900])
 def test_the_first_scans_wait_with_their_images(calibration: Calibration, period_ms: int) -> None:
     synchronizer = Synchronizer(Sync(), calibration, {"cloud", "left"})

@@ -181,17 +181,16 @@ class SessionClock:
         newest = self._newest.get(arrival.name)
         if newest is None and self._is_stale(arrival.stamp_ns):
             return replace(arrival, fault="stale")
-        if newest is not None and arrival.stamp_ns <= newest.stamp_ns:
+        if newest is not None and arrival.stamp_ns <= newest.stamp_ns and not _is_part(newest, arrival):
             return replace(arrival, fault="duplicate" if arrival.stamp_ns == newest.stamp_ns else "out of order")
         if newest is not None:
             periods = self._periods_ns.setdefault(arrival.name, deque(maxlen=PERIODS))
-            periods.append(arrival.stamp_ns - newest.stamp_ns)
+            if arrival.stamp_ns > newest.stamp_ns:
+                periods.append(arrival.stamp_ns - newest.stamp_ns)
         if arrival.name == ODOMETRY:
             self._motion.add(arrival.stamp_ns, arrival.value)
-        # an image is not kept alive for its stamp
-        self._newest[arrival.name] = (
-            arrival if arrival.name == ODOMETRY else StampedInput(arrival.name, arrival.stamp_ns)
-        )
+        kept = arrival.name in (ODOMETRY, "cloud")  # an image is not kept alive for its stamp
+        self._newest[arrival.name] = arrival if kept else StampedInput(arrival.name, arrival.stamp_ns)
         if self._now_ns is None:
             self._now_ns = self.start_ns = arrival.stamp_ns
         self._now_ns = max(self._now_ns, arrival.stamp_ns)
@@ -202,6 +201,14 @@ class SessionClock:
         if self._previous_end_ns is None or self._now_ns is None or stamp_ns <= self._now_ns:
             return False
         return abs(self._previous_end_ns - stamp_ns) < stamp_ns - self._now_ns
+
+
+def _is_part(one: StampedInput, other: StampedInput) -> bool:
+    """Return whether two messages of one stamp are different parts of a scan, and not the same message twice."""
+    points = [getattr(message.value, "points", None) for message in (one, other)]
+    if one.stamp_ns != other.stamp_ns or points[0] is None or points[1] is None:
+        return False
+    return not np.array_equal(*points)
 
 
 def _goes_on(held: _Held, found: _Held, arrival: StampedInput) -> bool:

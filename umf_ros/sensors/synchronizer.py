@@ -138,6 +138,7 @@ class Synchronizer:
         self._anchors: deque[Anchor] = deque()
         self._frames: list[Frame] = []
         self._given_up_ns = -1  # images up to here come too late
+        self._last_scan_ns = -1
 
     def use_camera(self, camera: StereoCamera) -> None:
         """Replace the intrinsics by those of a camera_info."""
@@ -222,6 +223,10 @@ class Synchronizer:
     def _await(self, scans: list[WholeScan]) -> None:
         """Let frames wait for the other inputs of whole scans."""
         for scan in scans:
+            if scan.stamp_ns == self._last_scan_ns:  # of another LiDAR: one frame has one scan
+                self.counters["cloud"].dropped["duplicate"] += scan.messages
+                continue
+            self._last_scan_ns = scan.stamp_ns
             key = scan.stamp_ns + round(self._calibration.lidar_time_offset_s * 1e9)
             self._anchors.append(Anchor(key, scan.stamp_ns, self._limits.apply(scan.cloud), scan.messages))
 
@@ -234,7 +239,7 @@ class Synchronizer:
         if of_clock:
             self._left.clear()
             self._right.clear()
-            self._given_up_ns = -1
+            self._given_up_ns = self._last_scan_ns = -1
 
     def _build(self) -> None:
         """Complete the frames that lack no input, in order."""
