@@ -18,7 +18,7 @@ from umf_ros.core.geometry import Array, invert, transform
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float32]
-WORDS_WEIGHT = 0.4
+WORDS_WEIGHT = 0.54
 """Cosine similarity of the network that one unit of the similarity by words is worth (`umf_ros.lab.fit.words`)."""
 
 

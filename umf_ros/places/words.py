@@ -68,7 +68,8 @@ class Words:
         """
         dimension, head = self.centres.shape[1], WORDS // 8
         occurs, other = (np.unpackbits(one[..., :head], axis=-1).astype(np.int32) for one in (query, codes))
-        different = _BITS[codes[:, head:] ^ query[head:]].reshape(len(codes), WORDS, -1).sum(axis=2)
+        bits = _BITS[codes[:, head:] ^ query[head:]]
+        different = bits.reshape(len(codes), WORDS, bits.shape[1] // WORDS).sum(axis=2)
         products = ((dimension - 2 * different) * (occurs & other)).sum(axis=1)
         norm = np.sqrt(np.maximum(occurs.sum() * other.sum(axis=1), 1)) * dimension
         return (products / norm).astype(np.float32)

@@ -25,7 +25,7 @@ from umf_ros.sensors.calibration import load_calibration
 
 WARM_UP = 3
 BY_WORDS = ("image, network", "words", "image", "cloud empty, network", "cloud empty", "fused", "fused, words")
-"""What is asked with the words and without; "image" and "cloud empty" are what the place database does."""
+"""Scores with and without words; "image" and "cloud empty" are those of the place database."""
 
 ETNA_RECALL1 = {
     # [UMF table 5.7]: what the method reached on the real data of Mt Etna, in per cent
