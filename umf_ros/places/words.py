@@ -1,4 +1,4 @@
-"""Words of a place database: hard-assigned VLAD [Jegou 2010] on the image trunk's map, with one bit per component."""
+"""Words of a place database: hard-assigned VLAD [Jégou 2010] on the image trunk's map, with one bit per component."""
 
 from __future__ import annotations
 
