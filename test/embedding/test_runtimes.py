@@ -17,9 +17,10 @@ from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.errors import ConfigError, WeightsError
 from umf_ros.core.resources import find
 from umf_ros.embedding import FeatureRequest
-from umf_ros.embedding.inputs import pack, prepare_scan
+from umf_ros.embedding.inputs import pack, prepare_scan, standardise
 from umf_ros.embedding.runtimes import (
     OUTPUTS,
+    SCENE_MAP,
     SUPERS,
     OpenVinoRuntime,
     Runtime,
@@ -88,6 +89,24 @@ def test_half_precision_of_a_gpu_changes_descriptors_little():
         assert half.dtype == np.float32 and not np.array_equal(half, single)
         assert (half * single).sum() / np.linalg.norm(half) / np.linalg.norm(single) > 0.999
         assert name_outputs(weights, runtime) == name.replace("-", "-float16-")
+
+
+def test_the_map_of_the_trunk_comes_with_the_descriptor_in_eight_bits_as_well():
+    """The shipped model was exported without this output."""
+    weights = locate_weights(None)
+    config = read_config(weights)
+    rows, columns = np.indices(config.image_size)
+    image = standardise((128 + 60 * np.sin(rows / 9) + 60 * np.sin(rows * columns / 4000)).astype(np.uint8))
+    umf = pack([image], [prepare_scan(some_scan(0), None, config)], config)
+    quantised, single = (
+        make_runtime(weights, settings(runtime), ("descriptor", SCENE_MAP)).run(umf) for runtime in ("auto", "torch")
+    )
+    assert set(quantised) == set(single) == {"descriptor", SCENE_MAP}
+    assert quantised[SCENE_MAP].shape == (112, *(side // 16 for side in config.image_size))
+    ours, theirs = (found[SCENE_MAP] / np.linalg.norm(found[SCENE_MAP], axis=0) for found in (quantised, single))
+    assert np.median((ours * theirs).sum(axis=0)) > 0.9
+    without = make_runtime(weights, settings(), ("descriptor",)).run(umf)
+    np.testing.assert_array_equal(without["descriptor"], quantised["descriptor"])
 
 
 def test_only_requested_outputs_are_computed():

@@ -18,6 +18,8 @@ from umf_ros.core.geometry import Array, invert, transform
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float32]
+WORDS_WEIGHT = 0.54
+"""Cosine similarity of the network that one unit of the similarity by words is worth (`umf_ros.lab.fit.words`)."""
 
 
 class State(StrEnum):
@@ -143,7 +145,8 @@ class SuperFeatures:
 class Embedding:
     """The network's description of one frame: a global descriptor and the features of each modality that it has.
 
-    The descriptor is (D,) float32, L2-normalised; similarity is the dot product.
+    The descriptor is (D,) float32, L2-normalised; similarity is the dot product. The scene is (N, C) int8, the
+    directions of the cells of the image trunk's deepest map, for `umf_ros.places.words`.
     """
 
     descriptor: NDArray[np.float32]
@@ -151,6 +154,7 @@ class Embedding:
     cloud: LocalFeatures | None = None
     super_image: SuperFeatures | None = None
     super_cloud: SuperFeatures | None = None
+    scene: NDArray[np.int8] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,6 +196,7 @@ class Candidate:
         index: row in the database.
         stamp_ns: key of the candidate keyframe.
         similarity: cosine similarity of the global descriptors.
+        words: similarity by the words of the database; 0 where it was not compared.
         inliers_image: pairs of image features that one homography explains; NaN before the reranking.
         inliers_cloud: pairs of the scan's features that one rigid motion explains; NaN before the reranking.
         superfeatures: eligible pairs of super-features of both modalities; NaN before the reranking.
@@ -205,6 +210,12 @@ class Candidate:
     inliers_cloud: float = math.nan
     superfeatures: float = math.nan
     score: float = 0.0
+    words: float = 0.0
+
+    @property
+    def combined(self) -> float:
+        """Both similarities as one, in the unit of the cosine similarity."""
+        return self.similarity + WORDS_WEIGHT * self.words
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,6 +31,8 @@ Outputs = dict[str, NDArray[np.float32]]
 XFEAT_SHAPE = 1, 1, 384, 512
 OUTPUTS = ("descriptor", "image_local", "image_saliency", "cloud_local", "cloud_saliency")
 """Distinct from the names of inputs: OpenVINO renames a tensor whose name is taken."""
+SCENE_MAP = "scene_map"
+"""Deepest map (C, H / 16, W / 16) of the scene descriptor's trunk, of a network that has one."""
 SUPERS = ("super_image", "super_image_strength", "super_cloud", "super_cloud_strength")
 MODEL_SUFFIX = ".openvino"
 """Suffix of the zip archive of `model.xml` and `model.bin` beside a weights file."""
@@ -61,6 +63,8 @@ class OpenVinoRuntime:
         with reading(path, WeightsError, "is damaged"):
             with open_archive(path) as archive:
                 model = openvino_core().read_model(archive.read("model.xml"), archive.read("model.bin"))
+            if SCENE_MAP in outputs:
+                _expose_scene_map(model)
             self.precision, made_from = (model.get_rt_info([FACTS, name]).value for name in ("precision", "weights"))
         if made_from != hashlib.sha256(weights.read_bytes()).hexdigest():
             raise WeightsError(f"{path} was made from other weights; delete it, or make it again with umf export")
@@ -196,6 +200,16 @@ def openvino_core() -> Any:
     core was created and destroyed crashes at Ctrl-C.
     """
     return import_openvino().Core()
+
+
+def _expose_scene_map(model: Any) -> None:
+    """Make the map that the scene descriptor is pooled from an output of a model that was exported without it."""
+    if any(SCENE_MAP in port.get_names() for port in model.outputs):
+        return
+    pooling = next(op for op in model.get_ops() if op.get_type_name() == "AdaptiveAvgPool")
+    source = pooling.input_value(0)
+    source.get_tensor().set_names({SCENE_MAP})
+    model.add_outputs(source)
 
 
 def _cache_options() -> dict[str, str]:

@@ -121,7 +121,11 @@ class SceneDescriptor(nn.Module):
 
     def pool(self, image: Tensor) -> Tensor:
         """Return maps (B, C, 3, 5) of a standardised image (B, 1, H, W), with the mean over the cells removed."""
-        cells = F.adaptive_avg_pool2d(self.trunk(image)[-1], GRID)
+        return self.pool_map(self.trunk(image)[-1])
+
+    def pool_map(self, deepest: Tensor) -> Tensor:
+        """Return maps (B, C, 3, 5) of the trunk's deepest map (B, C, H, W), with the mean over the cells removed."""
+        cells = F.adaptive_avg_pool2d(deepest, GRID)
         return cells - cells.mean(dim=(2, 3), keepdim=True)
 
     def project(self, cells: Tensor) -> Tensor:

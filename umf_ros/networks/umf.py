@@ -31,6 +31,7 @@ class Features:
         fine_image: (B, C, H/4, W/4).
         fine_cloud: (B, V, C).
         scene: (B, S), scene descriptors, longer for unfamiliar views; None without this part.
+        scene_map: (B, C, H/16, W/16), the map that they are pooled from; None without this part.
     """
 
     image: Tokens
@@ -38,6 +39,7 @@ class Features:
     fine_image: Tensor
     fine_cloud: Tensor
     scene: Tensor | None = None
+    scene_map: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +50,7 @@ class NetworkOutput:
         descriptor: (B, D) float32, L2-normalised.
         image, cloud: local features.
         super_image, super_cloud: super-features, on request.
+        scene_map: (B, C, H/16, W/16), deepest map of the scene descriptor's trunk; None without this part.
     """
 
     descriptor: Tensor
@@ -55,6 +58,7 @@ class NetworkOutput:
     cloud: LocalMap
     super_image: SuperMap | None = None
     super_cloud: SuperMap | None = None
+    scene_map: Tensor | None = None
 
 
 class UMF(nn.Module):
@@ -84,7 +88,11 @@ class UMF(nn.Module):
         """Run the encoders and add the positions to the tokens."""
         image, fine_image = self.encode_image(batch)
         cloud, fine_cloud = self.encode_cloud(batch)
-        return Features(image, cloud, fine_image, fine_cloud, None if self.scene is None else self.scene(batch.image))
+        if self.scene is None:
+            return Features(image, cloud, fine_image, fine_cloud)
+        scene_map = self.scene.trunk(batch.image)[-1]
+        scene = self.scene.project(self.scene.pool_map(scene_map).flatten(1))
+        return Features(image, cloud, fine_image, fine_cloud, scene, scene_map)
 
     def encode_image(self, batch: NetworkInput) -> tuple[Tokens, Tensor]:
         """Return the tokens and the fine features of the images."""
@@ -123,7 +131,7 @@ class UMF(nn.Module):
         supers: tuple[SuperMap | None, SuperMap | None] = (None, None)
         if super_features:
             supers = self.super_image(image.tokens, image.mask), self.super_cloud(cloud.tokens, cloud.mask)
-        return NetworkOutput(fused.descriptor, image, cloud, *supers)
+        return NetworkOutput(fused.descriptor, image, cloud, *supers, scene_map=features.scene_map)
 
 
 class FlatUmf(nn.Module):
@@ -149,6 +157,8 @@ class FlatUmf(nn.Module):
             "cloud_local": found.cloud.descriptors,
             "cloud_saliency": found.cloud.saliency,
         }
+        if found.scene_map is not None:
+            named["scene_map"] = found.scene_map
         for name in ("super_image", "super_cloud"):
             supers = getattr(found, name)
             if supers is not None:

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from umf_ros.core.config import Database, Loop
 from umf_ros.core.errors import OutputError, UmfError, one_line
-from umf_ros.core.frames import Candidate, Keyframe, Points
+from umf_ros.core.frames import WORDS_WEIGHT, Candidate, Keyframe, Points
 from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import atomic_write
 from umf_ros.core.limits import read_json
 from umf_ros.places.store import KeyframeStore, index_path
+from umf_ros.places.words import FITTED_ON, Code, fit_words
 
 logger = logging.getLogger(__name__)
 
@@ -81,6 +82,7 @@ class PlaceDatabase:
 
     Attributes:
         listed: sessions that the map of these places lists; None where they are of no map.
+        words: fitted to the first images of the database and kept from then on; None before.
 
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use.
@@ -95,6 +97,8 @@ class PlaceDatabase:
         self._begun: dict[int, int] = {}  # of sessions: closures name stamps, and later clocks may begin again there
         try:
             self.index = self._open_index(dimension)
+            self.words = self.store.words()
+            self._learn_words()  # a process may have been killed between its last keyframe and the words
         except BaseException:
             self.store.close()
             raise
@@ -145,18 +149,21 @@ class PlaceDatabase:
 
     def add(self, keyframe: Keyframe) -> int:
         """Store a keyframe and return its index."""
-        row = self.store.add(keyframe)
+        row = self.store.add(keyframe, self._describe(keyframe))
         self._begun.setdefault(keyframe.session, keyframe.stamp_ns)
         self.index.add(keyframe.embedding.descriptor[None])
         self.index.compress()
         if len(self.index) - self._saved >= max(BATCH, self._saved // 4):
             self._save_index()
+        self._learn_words()
         return row
 
     def query(self, keyframe: Keyframe, rules: Loop, sessions: range | None = None) -> list[Candidate]:
         """Return the most similar earlier places, best first.
 
         Keyframes must lie far enough back, by `is_past`. A place of many sessions does not displace the others.
+        A keyframe without a scan is compared by the words, too (*measured*: of keyframes with both, the words of
+        images add nothing to the descriptor).
 
         Args:
             keyframe: the query.
@@ -166,15 +173,16 @@ class PlaceDatabase:
         admissible, descriptor = partial(self.admissible, keyframe, rules, sessions), keyframe.embedding.descriptor
         for wanted in (2 * rules.top_k, WIDER * rules.top_k):
             rows = np.sort(self.index.search(descriptor, wanted + MARGIN, admissible))
-            similarity = self.store.descriptors(rows) @ descriptor
-            order = np.argsort(-similarity, kind="stable")[:wanted]  # equal ones in order of row
+            similarity, words = self.store.descriptors(rows) @ descriptor, self._compare_words(keyframe, rows)
+            order = np.argsort(-(similarity + WORDS_WEIGHT * words), kind="stable")[:wanted]  # equal ones by row
             order = order[similarity[order] >= rules.min_similarity]
             similar = [(int(rows[i]), float(similarity[i])) for i in order]
+            alike = dict(zip(rows.tolist(), words.tolist(), strict=True))
             chosen = self._diverse(similar, rules.top_k)
             if len(chosen) == rules.top_k or len(similar) < wanted:
                 break
         stamps = self.store.keys["stamp_ns"]
-        return [Candidate(row, int(stamps[row]), similarity) for row, similarity in chosen]
+        return [Candidate(row, int(stamps[row]), similarity, words=alike[row]) for row, similarity in chosen]
 
     def admissible(self, keyframe: Keyframe, rules: Loop, sessions: range | None, rows: Rows | slice) -> Mask:
         """Return which of some rows may be candidates of a keyframe, as in `query`."""
@@ -191,6 +199,29 @@ class PlaceDatabase:
         if len(self.index) - self._saved >= BATCH:
             self._save_index()
         self.store.close()
+
+    def _learn_words(self) -> None:
+        """Fit words, once there are enough images, and describe all places with them."""
+        if self.words is not None or self.store.read_only or self.store.with_scene < FITTED_ON:
+            return
+        scenes = (self[row].embedding.scene for row in self.store.rows_with_scene(FITTED_ON))
+        words = fit_words([scene for scene in scenes if scene is not None])
+        self.store.freeze_words(words)
+        self.words = words
+
+    def _describe(self, keyframe: Keyframe) -> Code | None:
+        scene = keyframe.embedding.scene
+        return None if self.words is None or scene is None else self.words.describe(scene)
+
+    def _compare_words(self, keyframe: Keyframe, rows: Rows) -> Points:
+        """Return similarities (R,) of places by the words; 0 without words or images, or where scans are compared."""
+        similarity = np.zeros(len(rows), np.float32)
+        if self.words is None or keyframe.embedding.cloud is not None or not len(rows):
+            return similarity
+        if (code := self._describe(keyframe)) is not None:
+            known, codes = self.store.codes(rows, self.words.code_bytes)
+            similarity[known] = self.words.compare(code, codes)
+        return similarity
 
     def _open_index(self, dimension: int) -> PlaceIndex:
         """Return the index of the file, if it matches the store, completed from the store."""

@@ -22,6 +22,7 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Embedding, Keyframe, LocalFeatures, ScanMotion, StereoCamera, SuperFeatures
 from umf_ros.core.io import Schema, SqliteFile
 from umf_ros.core.limits import LARGEST_TEXT, check_size
+from umf_ros.places.words import WORDS, Code, Words
 
 SCHEMA = Schema(
     "place database",
@@ -35,6 +36,11 @@ SCHEMA = Schema(
         # covers the keys of all keyframes on a hundredth of the pages
         ("CREATE INDEX IF NOT EXISTS keyframe_by_stamp ON keyframe (stamp_ns, session, travelled_m)",),
         ("CREATE TABLE submap (id INTEGER PRIMARY KEY, keypoints BLOB NOT NULL)",),
+        (
+            "CREATE TABLE words (name TEXT NOT NULL, centres BLOB NOT NULL)",
+            # a row for every keyframe with local vectors of its image; empty until there are words
+            "CREATE TABLE code (id INTEGER PRIMARY KEY, code BLOB NOT NULL)",
+        ),
     ),
 )
 OUTBOX = Schema(
@@ -75,6 +81,9 @@ class KeyframeStore:
         read_only: the file must exist and is only read; another process may write it.
         outgoing: whether every keyframe is queued for a fleet's server.
 
+    Attributes:
+        with_scene: number of keyframes with local vectors of their image.
+
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use; any method: it is damaged.
         OutputError: the file cannot be written.
@@ -98,6 +107,7 @@ class KeyframeStore:
                 if outgoing:
                     self._file.migrate(OUTBOX)
                 self._keys = _read_keys(connection)
+                self.with_scene = _count_scenes(connection)
         except BaseException:
             self._file.close()
             raise
@@ -136,20 +146,23 @@ class KeyframeStore:
         """Return indices of the keyframes of a stamp, in order."""
         return self._rows("SELECT id FROM keyframe WHERE stamp_ns = ? ORDER BY id", stamp_ns)
 
-    def add(self, keyframe: Keyframe) -> int:
-        """Append a keyframe and return its index."""
+    def add(self, keyframe: Keyframe, code: Code | None = None) -> int:
+        """Append a keyframe, with its code by the words of the file, and return its index."""
         with self._lock:
             row = int(self.keys["id"][-1]) + 1 if len(self) else 1
             key = row, keyframe.stamp_ns, keyframe.session, keyframe.path_length_m
             descriptor = np.ascontiguousarray(keyframe.embedding.descriptor, np.float32).tobytes()
             with self._file.writing() as connection:
                 connection.execute("INSERT INTO keyframe VALUES (?, ?, ?, ?, ?, ?)", (*key, descriptor, pack(keyframe)))
+                if keyframe.embedding.scene is not None:
+                    connection.execute("INSERT INTO code VALUES (?, ?)", (row, b"" if code is None else code.tobytes()))
                 if self._outgoing:
                     connection.execute("INSERT OR IGNORE INTO outbox VALUES (?)", (row,))
             if self._count == len(self._keys):
                 self._keys = np.concatenate([self._keys, np.empty(max(256, self._count // 4), _KEYS)])
             self._keys[self._count] = key
             self._count += 1
+            self.with_scene += keyframe.embedding.scene is not None
             self._remember(row, keyframe)
             return self._count - 1
 
@@ -168,6 +181,44 @@ class KeyframeStore:
             rows = np.searchsorted(self.keys["id"], list(found)).tolist()
             stored = [np.frombuffer(blob, np.float16).reshape(-1, 130).astype(np.float32) for blob in found.values()]
             return dict(zip(rows, stored, strict=True))
+
+    def words(self) -> Words | None:
+        """Return the words of the file; None before they are fitted, and of a file of an earlier release."""
+        with self._reading() as connection:
+            if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'words'").fetchone():
+                return None
+            if (row := connection.execute("SELECT name, centres FROM words").fetchone()) is None:
+                return None
+            words = Words(np.frombuffer(row[1], np.float32).reshape(WORDS, -1))
+            if words.name != row[0]:
+                raise ValueError("its words are not those that their name states")
+            return words
+
+    def rows_with_scene(self, count: int) -> list[int]:
+        """Return indices of the first keyframes with local vectors of their image."""
+        return self._rows("SELECT id FROM code JOIN keyframe USING (id) ORDER BY id LIMIT ?", count)
+
+    def freeze_words(self, words: Words) -> None:
+        """Store words, and the codes of all keyframes so far, in one transaction."""
+        rows = self.rows_with_scene(len(self))
+        codes = []
+        for index in rows:
+            scene = self[index].embedding.scene
+            code = None if scene is None else words.describe(scene)
+            codes.append((b"" if code is None else code.tobytes(), int(self.keys["id"][index])))
+        with self._lock, self._file.writing() as connection:
+            connection.execute("INSERT INTO words VALUES (?, ?)", (words.name, words.centres.tobytes()))
+            connection.executemany("UPDATE code SET code = ? WHERE id = ?", codes)
+
+    def codes(self, rows: NDArray[np.intp], size: int) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
+        """Return which of some indices (N,) have a code of `size` bytes, as positions (K,), and the codes (K, size)."""
+        ids = self.keys["id"][rows].tolist()
+        statement = f"SELECT id, code FROM code WHERE id IN ({','.join('?' * len(ids))})"
+        with self._reading() as connection:
+            blobs = {one: blob for one, blob in connection.execute(statement, ids) if len(blob) == size}
+        places = [place for place, one in enumerate(ids) if one in blobs]
+        found = np.frombuffer(b"".join(blobs[ids[place]] for place in places), np.uint8)
+        return np.array(places, np.intp), found.reshape(-1, size)
 
     @property
     def store_id(self) -> UUID:
@@ -234,6 +285,8 @@ def pack(keyframe: Keyframe) -> bytes:
         "travelled_m": np.array([keyframe.path_length_m]),
         "descriptor": embedding.descriptor,
     }
+    if embedding.scene is not None:
+        arrays["scene"] = embedding.scene
     if keyframe.odom_T_body is not None:
         arrays["odom_T_body"] = keyframe.odom_T_body
     groups = {group: getattr(embedding, group) for group in FEATURES} | {MOTION: keyframe.motion}
@@ -260,7 +313,7 @@ def unpack(blob: bytes) -> Keyframe:
     features = {group: _group(arrays, group, kind) for group, kind in FEATURES.items()}
     return Keyframe(
         stamp_ns=stamp_ns,
-        embedding=Embedding(arrays["descriptor"], **features),
+        embedding=Embedding(arrays["descriptor"], **features, scene=arrays.get("scene")),
         camera=StereoCamera(int(width), int(height), *rest),
         body_T_camera=arrays["body_T_camera"],
         body_T_lidar=arrays["body_T_lidar"],
@@ -317,7 +370,8 @@ def delete_sessions(path: Path, numbers: Collection[int]) -> int:
         index_path(path).unlink(missing_ok=True)
         statement = "DELETE FROM keyframe WHERE session = ?"
         deleted = sum(connection.execute(statement, (number,)).rowcount for number in set(numbers))
-        connection.execute("DELETE FROM submap WHERE id NOT IN (SELECT id FROM keyframe)")  # ids are used again
+        for table in ("submap", "code"):  # ids are used again
+            connection.execute(f"DELETE FROM {table} WHERE id NOT IN (SELECT id FROM keyframe)")
         return deleted
 
 
@@ -355,6 +409,13 @@ def _check_keys(connection: sqlite3.Connection) -> None:
     wrong = "typeof(stamp_ns) != 'integer' OR typeof(session) != 'integer' OR typeof(travelled_m) IN ('text', 'blob')"
     if found := connection.execute(f"SELECT id FROM keyframe WHERE {wrong} LIMIT 1").fetchone():
         raise ValueError(f"the stamp, session or path length of keyframe {found[0]} is not a number")
+
+
+def _count_scenes(connection: sqlite3.Connection) -> int:
+    """Return the number of keyframes with local vectors of their image; none of a file of an earlier release."""
+    if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'code'").fetchone():
+        return 0
+    return int(connection.execute("SELECT count(*) FROM code").fetchone()[0])
 
 
 def _read_keys(connection: sqlite3.Connection) -> NDArray[np.void]:

@@ -97,8 +97,8 @@ def rerank(query: Keyframe, candidates: Sequence[Offered], settings: Verificatio
         counts = count(query, keyframe, settings)
         image, cloud, *both = (float(counts.get(name) or 0) for name in (settings.features, "cloud", *SUPER))
         found = replace(candidate, inliers_image=image, inliers_cloud=cloud, superfeatures=sum(both))
-        ranked.append((replace(found, score=score(candidate.similarity, counts)), keyframe))
-    return sorted(ranked, key=lambda item: (-item[0].score, -item[0].similarity, item[0].stamp_ns))
+        ranked.append((replace(found, score=score(candidate.combined, counts)), keyframe))
+    return sorted(ranked, key=lambda item: (-item[0].score, -item[0].combined, item[0].stamp_ns))
 
 
 @cache
@@ -128,7 +128,7 @@ def select(ranked: list[Offered], count: int) -> list[Offered]:
     The order of the local features and that of the global descriptor take turns, for either may be
     blind (features under another sun, descriptors in a place that repeats).
     """
-    similar = sorted(ranked, key=lambda item: (-item[0].similarity, item[0].stamp_ns))
+    similar = sorted(ranked, key=lambda item: (-item[0].combined, item[0].stamp_ns))
     chosen: list[Offered] = []
     for item in (one for pair in zip(ranked, similar, strict=True) for one in pair):
         if len(chosen) < count and not any(_same_place(item[1], other) for _, other in chosen):

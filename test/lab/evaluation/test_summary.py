@@ -36,7 +36,9 @@ CURVE = precision_recall(np.array([0.9, 0.5]), np.array([True, False]), np.ones(
 NAMES = (*ASKED, "same light", *METHODS)
 KEYS = (
     "recall1_fused_mean recall1_fused_worst recall1_image_mean recall1_lidar_mean recall1_superfeatures_mean "
-    "recall1_ransac_mean recall1_image_black_mean recall1_cloud_empty_mean recall1_within5m_mean auc_pr_mean "
+    "recall1_ransac_mean recall1_image_black_mean recall1_cloud_empty_mean "
+    "recall1_image_network_mean recall1_words_mean recall1_cloud_empty_network_mean recall1_fused_words_mean "
+    "recall1_image_worst recall1_within5m_mean auc_pr_mean "
     "recall_at_precision1_mean embed_ms_default embed_ratio_default parameters_default"
 ).split()
 COST = Cost("small", 2**20, 40.0, 10.0)

@@ -55,6 +55,7 @@ SENSES = {
     "netvlad": "image",
     "minkloc_visual": "image",
     "lite0_gem": "image",
+    "anyloc_vlad": "image",
     "thumbnail": "image",
     "gradients": "image",
     "pointnet2": "scan",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -17,7 +17,15 @@ from umf_ros.core.geometry import transform
 from umf_ros.core.io import read_yaml
 from umf_ros.embedding import Embedder, check_inputs, make_embedder
 from umf_ros.lab.evaluation.results import EvaluationReport, Figures, Scores, TextTable, percent, rounded, score
-from umf_ros.lab.evaluation.retrieval import Mask, PlaceCollection, RetrievalTask, rank, rerank_all
+from umf_ros.lab.evaluation.retrieval import (
+    Mask,
+    PlaceCollection,
+    RetrievalTask,
+    rank,
+    rerank_all,
+    with_words,
+    word_similarity,
+)
 from umf_ros.lab.scan_files import SUFFIXES, read_picture, read_scan
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
@@ -55,20 +63,23 @@ class PlaceScores(NamedTuple):
     Attributes:
         name: of the set.
         references: how many there are.
-        plain: by the global descriptor.
+        plain: by the global descriptor, and by words where the method has local vectors of images.
         reranked: by local features too; None of a method that has none.
+        parts: by the descriptor alone, "network", and by the words alone; empty where there are no words.
     """
 
     name: str
     references: int
     plain: Scores
     reranked: Scores | None
+    parts: Mapping[str, Scores]
 
     @property
     def flat(self) -> Figures:
         """The figures by their published names; None for what could not be measured."""
         figures = ("recall1", "recall5", "auc_pr", "recall_at_precision1")
         values = {name: getattr(self.plain, name) for name in figures}
+        values |= {f"recall1_{name}": part.recall1 for name, part in self.parts.items()}
         values["recall1_reranked"] = self.reranked.recall1 if self.reranked else float("nan")
         return rounded({f"{self.name}.{name}": value for name, value in values.items()})
 
@@ -124,14 +135,17 @@ def score_places(
         found.add(frame)
         report()
     descriptors, asked, references = found.descriptors("fused"), len(task.queries), len(task.references)
-    similarity = descriptors[task.queries] @ descriptors[task.references].T
+    network = descriptors[task.queries] @ descriptors[task.references].T
+    ours, theirs = found.keyframes[:asked], found.keyframes[asked:]
+    words = word_similarity(ours, theirs)
+    similarity = with_words(network, words, ours)
     ranking = rank(similarity)
     plain = score(task, ranking)
+    parts = {name: score(task, rank(one)) for name, one in (("network", network), ("words", words)) if words.any()}
     if not any(keyframe.embedding.image or keyframe.embedding.cloud for keyframe in found.keyframes):
-        return PlaceScores(places.name, references, plain, None)
-    ours, theirs = found.keyframes[:asked], found.keyframes[asked:]
+        return PlaceScores(places.name, references, plain, None, parts)
     reranking = rerank_all(ours, theirs, ranking, similarity, settings, report)
-    return PlaceScores(places.name, references, plain, score(task, reranking.after(RERANKER)))
+    return PlaceScores(places.name, references, plain, score(task, reranking.after(RERANKER)), parts)
 
 
 def read_set(places: PlaceSet) -> tuple[list[Frame], RetrievalTask]:
@@ -173,14 +187,16 @@ def read_truth(path: Path, queries: int, references: int) -> Mask:
 
 def table_of(results: Sequence[PlaceScores]) -> TextTable:
     """A row per set."""
-    head = ["set", "queries", "references", "R@1 %", "R@5 %", "R@1 % reranked", "AUC-PR %", "R@100 % P"]
+    alone = ["R@1 % network alone", "R@1 % words alone"]
+    head = ["set", "queries", "references", *alone, "R@1 %", "R@5 %", "R@1 % reranked", "AUC-PR %", "R@100 % P"]
     rows = []
     for found in results:
         plain = found.plain
         again = percent(found.reranked.recall1) if found.reranked else "-"
         shares = map(percent, (plain.auc_pr, plain.recall_at_precision1))
-        row = [found.name, str(plain.queries), str(found.references), percent(plain.recall1), percent(plain.recall5)]
-        rows.append([*row, again, *shares])
+        parts = [percent(found.parts[name].recall1) if found.parts else "-" for name in ("network", "words")]
+        recalls = [*parts, percent(plain.recall1), percent(plain.recall5)]
+        rows.append([found.name, str(plain.queries), str(found.references), *recalls, again, *shares])
     return head, rows
 
 

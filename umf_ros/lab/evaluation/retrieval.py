@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.config import Loop, Verification
-from umf_ros.core.frames import Candidate, Embedding, Frame, Keyframe
+from umf_ros.core.frames import WORDS_WEIGHT, Candidate, Embedding, Frame, Keyframe
 from umf_ros.core.geometry import Array
 from umf_ros.embedding import Embedder
 from umf_ros.lab.datasets.sample import Rule, distances, label, places_of
 from umf_ros.places.database import is_past
+from umf_ros.places.words import FITTED_ON, fit_words
 from umf_ros.verification.rerank import rerank
 
 THESIS_RULE = Rule(positive_m=12.0, positive_deg=30.0, negative_m=60.0, negative_deg=30.0)
@@ -285,6 +286,34 @@ class Reranking:
         return np.array([self.after(method, count).hits(positive)[answerable, 0].mean() for count in counts])
 
 
+def word_similarity(queries: Sequence[Keyframe], references: Sequence[Keyframe]) -> Array:
+    """(Q, R) similarity by words of the first references, as in a place database; 0 without an image or too few."""
+    found = np.zeros((len(queries), len(references)))
+    scenes = [one.embedding.scene for one in references]
+    if len(known := [scene for scene in scenes if scene is not None]) < FITTED_ON:
+        return found
+    words = fit_words(known[:FITTED_ON])
+    ours, theirs = (
+        {
+            row: code
+            for row, scene in enumerate(each)
+            if scene is not None and (code := words.describe(scene)) is not None
+        }
+        for each in ([one.embedding.scene for one in queries], scenes)
+    )
+    codes = np.stack(list(theirs.values()))
+    for row, code in ours.items():
+        found[row, list(theirs)] = words.compare(code, codes)
+    return found
+
+
+def with_words(similarity: Array, words: Array, queries: Sequence[Keyframe]) -> Array:
+    """(Q, R) both similarities for queries without a scan, the network's for the others: those of a place database."""
+    without_scan = np.array([one.embedding.cloud is None for one in queries])
+    combined: Array = similarity + WORDS_WEIGHT * words * without_scan[:, None]
+    return combined
+
+
 def rerank_all(
     queries: Sequence[Keyframe],
     references: Sequence[Keyframe],
@@ -299,7 +328,7 @@ def rerank_all(
         queries: Q keyframes.
         references: R keyframes.
         ranking: of the references for every query.
-        similarity: (Q, R) of the global descriptors.
+        similarity: (Q, R) of the global descriptors, with the words where they count.
         settings: of the reranker.
         report: called after every query.
     """

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from umf_ros.core.config import EmbeddingSettings, Verification
-from umf_ros.core.frames import Frame, ScanMotion
+from umf_ros.core.frames import WORDS_WEIGHT, Frame, ScanMotion
 from umf_ros.core.geometry import Array
 from umf_ros.embedding import Embedder, make_embedder
 from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures
@@ -34,6 +34,7 @@ from umf_ros.lab.evaluation.retrieval import (
     place_recognition,
     rank,
     rerank_all,
+    word_similarity,
 )
 from umf_ros.lab.evaluation.summary import WorldResult, WorldsSummary, at_full_size, cost_of_weights
 from umf_ros.lab.simulation.camera import resized
@@ -170,12 +171,16 @@ def visit_of(stamp_ns: int, sample: SurveyFrame, calibration: Calibration) -> Vi
 
 
 ASKED = {
-    # what the queries and the references are embedded with
-    "fused": ("fused", "fused"),
-    "image": ("image", "image"),
-    "lidar": ("lidar", "lidar"),
-    "image black": ("image black", "fused"),
-    "cloud empty": ("cloud empty", "fused"),
+    # what the queries and the references are embedded with, and what descriptor and words count
+    "fused": ("fused", "fused", 1.0, 0.0),
+    "image": ("image", "image", 1.0, WORDS_WEIGHT),
+    "lidar": ("lidar", "lidar", 1.0, 0.0),
+    "image black": ("image black", "fused", 1.0, 0.0),
+    "cloud empty": ("cloud empty", "fused", 1.0, WORDS_WEIGHT),
+    "image, network": ("image", "image", 1.0, 0.0),
+    "cloud empty, network": ("cloud empty", "fused", 1.0, 0.0),
+    "words": ("image", "image", 0.0, 1.0),
+    "fused, words": ("fused", "fused", 1.0, WORDS_WEIGHT),
 }
 SHOWN = 3
 """Queries whose frames are kept for pictures."""
@@ -226,8 +231,8 @@ class WorldEvaluation:
             name=self._world.name,
             references=len(task.references),
             scores={
-                **{name: self._score((REVISIT,), *modes) for name, modes in ASKED.items()},
-                "same light": self._score((SAME_LIGHT,)),
+                **self._score_modes(word_similarity(queries, references)),
+                "same light": score(*self._ranked((SAME_LIGHT,))),
                 **{method: score(task, reranking.after(method)) for method in METHODS},
             },
             yaw=self._recall_by_yaw(),
@@ -262,13 +267,20 @@ class WorldEvaluation:
         queries, references = self._places.descriptors(of_query), self._places.descriptors(of_reference)
         return task, queries[task.queries] @ references[task.references].T
 
-    def _score(self, passes: tuple[int, ...], of_query: str = "fused", of_reference: str = "fused") -> Scores:
-        task, similarity = self._ask(passes, of_query, of_reference)
-        return score(task, rank(similarity))
+    def _score_modes(self, words: Array) -> dict[str, Scores]:
+        """Scores of all `ASKED`, given the similarity (Q, R) by words."""
+        found = {}
+        for name, (*modes, of_network, of_words) in ASKED.items():
+            task, similarity = self._ask((REVISIT,), *modes)
+            found[name] = score(task, rank(of_network * similarity + of_words * words))
+        return found
+
+    def _ranked(self, passes: tuple[int, ...]) -> tuple[RetrievalTask, Ranking]:
+        task, similarity = self._ask(passes)
+        return task, rank(similarity)
 
     def _recall_by_yaw(self) -> list[YawBin]:
-        task, similarity = self._ask((REVISIT, OPPOSITE))
-        return recall_by_yaw(task, rank(similarity))
+        return recall_by_yaw(*self._ranked((REVISIT, OPPOSITE)))
 
     def _examples(self, task: RetrievalTask, ranking: Ranking) -> list[tuple[Frame, Frame]]:
         found = np.flatnonzero(ranking.hits(task.positive)[:, 0])

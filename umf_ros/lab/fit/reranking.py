@@ -106,6 +106,24 @@ class Examples:
             return cls(name, simulated, content["similarity"], content["right"], content["wrong"], counts)
 
 
+def read_world(seed: int) -> tuple[list[Frame], RetrievalTask, Mask]:
+    """Frames of the first two passes of a world, the task, and the pairs (Q, R) that are near."""
+    visits = list(TestWorld(seed, SAMPLING).driven((FIRST, REVISIT)))
+    poses = np.stack([one.world_T_body for one in visits])
+    task = place_recognition(poses, np.array([one.pass_index for one in visits]))
+    near = (task.metres < THESIS_RULE.negative_m) & (task.turn_deg < THESIS_RULE.negative_deg)
+    return [one.frame for one in visits], task, near
+
+
+def near_places(task: RetrievalTask) -> Mask:
+    """Pairs (Q, R) of a set that are at most `NEIGHBOURS` references from a true one."""
+    near = task.positive.copy()
+    for shift in range(1, NEIGHBOURS + 1):
+        near[:, shift:] |= task.positive[:, :-shift]
+        near[:, :-shift] |= task.positive[:, shift:]
+    return near
+
+
 class ExampleMaker:
     """Embeds frames with every feature type, and counts what their candidates share."""
 
@@ -116,20 +134,12 @@ class ExampleMaker:
 
     def of_world(self, seed: int) -> Examples:
         """Examples of the second pass of a world."""
-        visits = [(one.frame, one) for one in TestWorld(seed, SAMPLING).driven((FIRST, REVISIT))]
-        poses = np.stack([one.world_T_body for _, one in visits])
-        task = place_recognition(poses, np.array([one.pass_index for _, one in visits]))
-        near = (task.metres < THESIS_RULE.negative_m) & (task.turn_deg < THESIS_RULE.negative_deg)
-        return self._examples(f"world {seed}", True, [frame for frame, _ in visits], task, near)
+        return self._examples(f"world {seed}", True, *read_world(seed))
 
     def of_set(self, places: PlaceSet) -> Examples:
         """Examples of a set of images or scans."""
         frames, task = read_set(places)
-        near = task.positive.copy()
-        for shift in range(1, NEIGHBOURS + 1):
-            near[:, shift:] |= task.positive[:, :-shift]
-            near[:, :-shift] |= task.positive[:, shift:]
-        return self._examples(places.name, False, frames, task, near)
+        return self._examples(places.name, False, frames, task, near_places(task))
 
     def _examples(self, name: str, simulated: bool, frames: list[Frame], task: RetrievalTask, near: Mask) -> Examples:
         own = [as_keyframe(frame, self._umf.embed(frame)) for frame in frames]
@@ -179,7 +189,7 @@ def _fit_similarity(examples: Sequence[Examples]) -> float:
 
     def loss(slope: Array) -> float:
         scores = [slope[0] / spread * one.similarity for one in examples]
-        return _surprise(examples, scores) + RIDGE * float(slope[0]) ** 2
+        return surprise(examples, scores) + RIDGE * float(slope[0]) ** 2
 
     return float(minimize(loss, [1.0], method="Nelder-Mead").x[0]) / spread
 
@@ -197,7 +207,7 @@ def _fit_counts(examples: Sequence[Examples], name: str, known: Fitted) -> dict[
         return [one.ratio(name, numbers(at, floor)) for one in examples]
 
     def loss(at: Array) -> float:
-        return _surprise(examples, [a + b for a, b in zip(given, said(at), strict=True)]) + RIDGE * at[0] ** 2
+        return surprise(examples, [a + b for a, b in zip(given, said(at), strict=True)]) + RIDGE * at[0] ** 2
 
     starts = [np.array([1.0, np.quantile(values, 0.2)]), np.array([3.0, np.quantile(values, 0.6)])]
     best = min((minimize(loss, start, method="Nelder-Mead") for start in starts), key=lambda one: float(one.fun)).x
@@ -212,7 +222,7 @@ def _shares(examples: Sequence[Examples]) -> list[float]:
     return [0.5 / (worlds if one.simulated else len(examples) - worlds) for one in examples]
 
 
-def _surprise(examples: Sequence[Examples], scores: Sequence[Array]) -> float:
+def surprise(examples: Sequence[Examples], scores: Sequence[Array]) -> float:
     """Mean negative log-likelihood that a query's right candidates are the right ones."""
     total = 0.0
     for one, odds, share in zip(examples, scores, _shares(examples), strict=True):
