@@ -1,0 +1,96 @@
+"""`umf slam` and `umf replay --odometry ENGINE` on drives with a LiDAR of 360 degrees, against the rover's odometry.
+
+    python benchmarks/accuracy/odometry_engines.py SEED... [--rings 64,16] [--images] [--json FILE]
+
+Each drive is the demo's with another LiDAR on the mast: 64 or 16 rings at 10 Hz, with a time per point. It is replayed
+with the odometry of the recording and with that of the engine. `--narrow` adds the demo's own LiDAR of 70 degrees.
+Printed: true and false closures, errors of the odometry and of the optimised trajectory, and the real-time factor.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+import yaml
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from umf_ros.core.geometry import Array, interpolate, make_pose
+from umf_ros.core.resources import find
+from umf_ros.lab.simulation.bag_writer import BagWriter, cloud_message, odometry_message, pose_message
+from umf_ros.lab.simulation.camera import cast
+from umf_ros.lab.simulation.domains.scanners import spinning
+from umf_ros.lab.simulation.lidar import Scan
+from umf_ros.lab.simulation.presets import PRESETS
+from umf_ros.lab.simulation.simulator import CLOUD_TOPIC, START_NS, Simulator, stamp_ns
+
+ELEVATIONS_DEG = {64: np.linspace(-24.8, 2.0, 64), 16: np.linspace(-15.0, 15.0, 16)}
+COLUMNS = {64: 1024, 16: 1800}
+PERIOD_NS, RANGE_M, NOISE_M = 100_000_000, 100.0, 0.02
+MAST: Array = make_pose(np.eye(3), [0.2, 0.0, 1.6])
+"""`body_T_lidar` of the LiDAR of 360 degrees."""
+Event = tuple[int, int, str, Any]
+
+
+def write_drive(seed: int, rings: int, path: Path, tilt_deg: float = 0.0, preset: str = "demo") -> Path:
+    """Write a recording and its parameter file; return the latter. `tilt_deg` turns the LiDAR's front down."""
+    simulator = Simulator(PRESETS[preset], seed)
+    mounting = MAST @ make_pose(Rotation.from_euler("y", tilt_deg, degrees=True).as_matrix(), np.zeros(3))
+    with BagWriter(path) as bag:
+        streams = _clouds(simulator, rings, mounting), _poses(simulator)
+        for log_ns, _, topic, message in heapq.merge(*streams, key=lambda event: event[:2]):
+            bag.write(topic, message, log_ns)
+    calibration = yaml.safe_load(find("config/calibration/simulated.yaml").read_text(encoding="utf-8"))
+    quaternion = Rotation.from_matrix(mounting[:3, :3]).as_quat().tolist()
+    calibration["body_T_lidar"] = {"translation": mounting[:3, 3].tolist(), "quaternion": quaternion}
+    del calibration["min_intensity"], calibration["max_height_m"]
+    own, config = path.with_suffix(".calibration.yaml"), path.with_suffix(".yaml")
+    own.write_text(yaml.safe_dump(calibration), encoding="utf-8")
+    config.write_text(yaml.safe_dump({"dataset": "simulated", "calibration": str(own)}), encoding="utf-8")
+    return config
+
+
+def _clouds(simulator: Simulator, rings: int, body_T_lidar: Array) -> Iterator[Event]:
+    _ = simulator.world.scene
+    for number in range(int((simulator.duration_s - 0.3) * 1e9 / PERIOD_NS)):
+        stamp = START_NS + number * PERIOD_NS
+        scan = _scan(simulator, rings, body_T_lidar, stamp, np.random.default_rng([simulator.seed, rings, number]))
+        yield stamp + PERIOD_NS, 1, CLOUD_TOPIC, cloud_message(scan, stamp)
+
+
+def _scan(simulator: Simulator, rings: int, body_T_lidar: Array, stamp: int, rng: np.random.Generator) -> Scan:
+    """Return the returns of one turn of the moving LiDAR, each in the LiDAR's frame at its own time."""
+    pattern = spinning(tuple(ELEVATIONS_DEG[rings]), COLUMNS[rings], 0.0)
+    moments, inverse = np.unique(pattern.moments, return_inverse=True)
+    ends = np.stack([simulator.pose(stamp), simulator.pose(stamp + PERIOD_NS)]) @ body_T_lidar
+    poses = interpolate(*(np.repeat(one[None], len(moments), axis=0) for one in ends), moments)
+    world = np.einsum("nij,nj->ni", poses[inverse, :3, :3], pattern.directions)
+    distance = cast(simulator.world, poses[inverse, :3, 3], world.astype(np.float32)).distance
+    kept = np.isfinite(distance) & (distance > 0.5) & (distance < RANGE_M) & (rng.random(len(distance)) < 0.985)
+    ranges = distance + NOISE_M * rng.standard_normal(len(distance))
+    points = (pattern.directions * ranges[:, None])[kept].astype(np.float32)
+    intensity = np.full(len(points), 100, np.uint32)
+    offset_ns = (pattern.moments[kept] * PERIOD_NS).astype(np.uint32)
+    return Scan(points, intensity, np.zeros_like(intensity), offset_ns)
+
+
+def _poses(simulator: Simulator) -> Iterator[Event]:
+    run = simulator.odometry
+    true = simulator.motion.poses(run.times_s)
+    for time_s, pose, twist, spread, world_T_body in zip(
+        run.times_s, run.poses, run.twists, run.deviations, true, strict=True
+    ):
+        stamp = stamp_ns(time_s)
+        yield stamp, 2, "/odom", odometry_message(pose, twist, spread, stamp, ("odom", "base_link"))
+        yield stamp, 3, "/ground_truth/pose", pose_message(world_T_body, stamp, "world")
