@@ -15,8 +15,6 @@ from umf_ros.core.frames import Frame
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.scan_odometry import ENGINES, ScanOdometry
 
-FILE = "odometry.tum"
-"""Poses of the engine in the folder of a run."""
 MAX_LOST = 0.01
 """Share of scans that may not fit the motion before them (*by hand*: none of the validation drives has one)."""
 FIRST, FEWEST_POINTS = 5, 100

@@ -10,7 +10,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Frame, Points
-from umf_ros.core.geometry import Array, expmap, logmap, orthonormal, relative, rotation_angle
+from umf_ros.core.geometry import Array, evenly, expmap, logmap, orthonormal, relative, rotation_angle
 from umf_ros.core.odometry_noise import ACCELERATION
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.assembly import deskew
@@ -19,8 +19,8 @@ from umf_ros.sensors.decode import OdometrySample
 VOXEL_M, THINNED_M, RANGE_M, NEIGHBOURS = 0.5, 0.25, 80.0, 40
 """Voxels of the engine's map and of a scan, range of a scan, and points that a surface is fitted to: they have to reach
 the next ring of a LiDAR of 16 rings, or each ring would be a line that slides along itself."""
-MAX_ITERATIONS, SCANS_KEPT = 20, 100
-"""Of a registration; scans after which a voxel is forgotten that no point was matched with."""
+MAX_POINTS, MAX_ITERATIONS, SCANS_KEPT = 3000, 20, 100
+"""Points and iterations of a registration; scans after which a voxel is forgotten that no point was matched with."""
 
 
 class OdometryEngine(Protocol):
@@ -53,7 +53,9 @@ class Vgicp:
     def register(self, points: Points, step: Array) -> Array:
         """Return the pose (4, 4) of a scan in the frame of the first one, as `OdometryEngine` says."""
         near = points[np.einsum("ij,ij->i", points, points) < RANGE_M**2]
-        scan, _ = small_gicp.preprocess_points(near.astype(float), THINNED_M, NEIGHBOURS, 1)
+        thinned = small_gicp.voxelgrid_sampling(near.astype(float), THINNED_M, 1).points()
+        scan = small_gicp.PointCloud(thinned[evenly(len(thinned), MAX_POINTS)])
+        small_gicp.estimate_covariances(scan, num_neighbors=NEIGHBOURS, num_threads=1)
         if self._odom_T_body is None:
             self._odom_T_body = np.eye(4)
         else:
@@ -151,6 +153,4 @@ class ScanOdometry:
 
 
 ENGINES: dict[str, Callable[[], OdometryEngine]] = {"vgicp": Vgicp}
-"""Engines by name."""
-ENGINE = "vgicp"
-"""Engine of recordings without odometry."""
+"""Engines by the names of `umf_ros.core.resources.ODOMETRY_ENGINES`."""
