@@ -39,7 +39,7 @@ OdometryChoice = Annotated[
     typer.Option(
         "--odometry",
         metavar="FILE|ENGINE",
-        help="Odometry as a TUM file, or vgicp: that of the scans, the default where the recording has none.",
+        help="Odometry as a TUM file, or vgicp: that of the scans, the default where the recording has none; or none.",
     ),
 ]
 OdometryFrame = Annotated[
@@ -109,7 +109,7 @@ class ChosenOdometry:
     Attributes:
         path: TUM file of its poses; None for an engine.
         frame: of the poses in the file.
-        engine: that is to be run on the scans; empty where a file is given.
+        engine: that is to be run on the scans; empty where a file or none is wanted.
         is_wanted: whether the user named the engine, which is else used where the recording has no odometry.
     """
 
@@ -121,6 +121,9 @@ class ChosenOdometry:
     @classmethod
     def parse(cls, choice: str | None, frame: str) -> ChosenOdometry:
         """Return the choice of `--odometry` and `--odometry-frame`; raise a `ConfigError` if they do not fit."""
+        if choice == "none":
+            check_odometry_options(None, frame)
+            return cls(None, "body")
         if choice is None or (choice in ENGINES and not Path(choice).exists()):
             check_odometry_options(None, frame)
             return cls(None, "body", choice or ENGINES[0], choice is not None)
@@ -144,7 +147,7 @@ class ChosenOdometry:
 
         if self.path is not None:
             return read_odometry(self.path, self.frame, settings)
-        if not self.is_wanted and not can_track(recording, settings):
+        if not self.engine or not (self.is_wanted or can_track(recording, settings)):
             return None
         told: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
         console.print(f"odometry: {self.engine} on the scans of {topics_of(settings).cloud}", **told)
