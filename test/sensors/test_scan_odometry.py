@@ -57,7 +57,8 @@ def test_the_body_is_tracked_through_bent_scans(tmp_path: Path) -> None:
     path = odometry_of_scans(bag, settings(), "vgicp")
     assert path.stamps_ns[0] == START_NS and path.stamps_ns[-1] > START_NS + (SCANS - 1) * PERIOD_S * 1e9
     true = expmap(TWIST * ((path.stamps_ns - START_NS) * 1e-9)[:, None])
-    errors = [relative(relative(true[2], one), relative(path.poses[2], made)) for one, made in zip(true, path.poses)]
+    pairs = zip(true, path.poses, strict=True)
+    errors = [relative(relative(true[2], one), relative(path.poses[2], made)) for one, made in pairs]
     assert max(np.linalg.norm(one[:3, 3]) for one in errors) < 0.1
     assert max(rotation_angle(one) for one in errors) < np.deg2rad(1.0)
     again = odometry_of_scans(bag, settings(), "vgicp")
@@ -66,7 +67,7 @@ def test_the_body_is_tracked_through_bent_scans(tmp_path: Path) -> None:
 
 def test_a_lidar_that_loses_track_is_refused_in_one_line(tmp_path: Path) -> None:
     bag = open_bag(recording(tmp_path / "bag.mcap", room(np.random.default_rng(2)), jump_at=12))
-    with pytest.raises(BagError, match="vgicp lost track of the scans .* s after the start .*--odometry FILE.tum"):
+    with pytest.raises(BagError, match=r"vgicp lost track of the scans .* s after the start .*--odometry FILE\.tum"):
         odometry_of_scans(bag, settings(), "vgicp")
 
 

@@ -135,7 +135,7 @@ class ChosenOdometry:
         """Return the odometry of the file, or of the scans where that is wanted or the recording has none, else None.
 
         `made` is the file of an earlier run of the engine on this recording, where there is one; `warn` takes the
-        reason why an engine that nobody named fails.
+        reason why the default engine fails.
 
         Raises:
             BagError: the file cannot be read, or an engine fails that the user named.
