@@ -16,7 +16,7 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.scan_odometry import ENGINES, ScanOdometry
 
 MAX_LOST = 0.05
-"""Share of scans that may not fit the motion before them (*by hand*: validation drives have below .01, lost ones .5)."""
+"""Share of scans that may not fit the motion before them (*by hand*: .01 on good drives, .5 where track is lost)."""
 FIRST, FEWEST_POINTS = 5, 100
 """Scans that tell the velocity at the start, and returns of a scan that is used."""
 
