@@ -75,7 +75,8 @@ def _scan(simulator: Simulator, rings: int, body_T_lidar: Array, stamp: int, rng
     pattern = spinning(tuple(ELEVATIONS_DEG[rings]), COLUMNS[rings], 0.0)
     moments, inverse = np.unique(pattern.moments, return_inverse=True)
     ends = np.stack([simulator.pose(stamp), simulator.pose(stamp + PERIOD_NS)]) @ body_T_lidar
-    poses = interpolate(*(np.repeat(one[None], len(moments), axis=0) for one in ends), moments)
+    start, end = np.repeat(ends[:, None], len(moments), axis=1)
+    poses = interpolate(start, end, moments)
     world = np.einsum("nij,nj->ni", poses[inverse, :3, :3], pattern.directions)
     distance = cast(simulator.world, poses[inverse, :3, 3], world.astype(np.float32)).distance
     kept = np.isfinite(distance) & (distance > 0.5) & (distance < RANGE_M) & (rng.random(len(distance)) < 0.985)
