@@ -86,4 +86,4 @@ def _check(engine: str, odometry: ScanOdometry, max_gap_s: float) -> None:
     if lost > max(1, MAX_LOST * len(stamps_ns)):
         what = f"{engine} lost track of the scans {(odometry.lost_ns[0] - stamps_ns[0]) * 1e-9:.1f} s after the start"
         share = f"{lost} of {len(stamps_ns)} do not fit the motion before them"
-        raise BagError(f"{what} ({share}); the LiDAR sees too little: give odometry with --odometry FILE.tum")
+        raise BagError(f"{what} ({share}); it sees too little or moves too far: use --odometry FILE.tum")
