@@ -23,6 +23,7 @@ COMMANDS = {
     "import": "umf_ros.lab.commands.import_data",
     "inspect": "umf_ros.lab.commands.inspect",
     "replay": "umf_ros.commands.replay",
+    "slam": "umf_ros.commands.slam",
     "map": "umf_ros.commands.map:app",
     "compare": "umf_ros.lab.commands.compare",
     "sensors": "umf_ros.lab.commands.evaluate:sensors",

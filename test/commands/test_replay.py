@@ -118,7 +118,24 @@ def test_a_run_can_be_repeated_from_its_own_settings(run: Path, mini_bag: Path, 
     assert (tmp_path / "latest" / "config.yaml").read_text() == (run / "config.yaml").read_text()
 
 
-def test_without_odometry_closures_are_found_and_the_graph_is_skipped(
+def test_scans_make_the_odometry_of_a_recording_that_has_none(
+    mini_bag: Path, mini_config: Path, tmp_path: Path
+) -> None:
+    config = tmp_path / "no_odometry.yaml"
+    config.write_text(mini_config.read_text(encoding="utf-8").replace("loop:", "topics.odometry: '', loop:"))
+    done = umf("replay", mini_bag, "--config", config, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "odometry: vgicp on the scans of /bf_lidar/points_raw" in done.stdout
+    folder = (tmp_path / "out" / "latest").resolve()
+    summary = json.loads((folder / "summary.json").read_text())
+    truth = summary["ground_truth"]
+    assert truth["closures_true"] >= 3 and truth["closures_false"] == 0
+    assert truth["ate_odometry_m"] < 0.6 and truth["ate_optimized_m"] < 0.4
+    named = {"path": str(folder / "odometry.tum"), "frame": "body", "engine": "vgicp"}
+    assert summary["odometry_file"] == named and len(read_tum(folder / "odometry.tum")) > 20
+
+
+def test_without_any_odometry_closures_are_found_and_the_graph_is_skipped(
     mini_bag: Path, mini_config: Path, tmp_path: Path
 ) -> None:
     config = tmp_path / "no_odometry.yaml"
@@ -127,7 +144,7 @@ def test_without_odometry_closures_are_found_and_the_graph_is_skipped(
             "loop:", "topics.odometry: '', keyframe.untracked_period_s: 0.4, loop:"
         )
     )
-    done = umf("replay", mini_bag, "--config", config, "--out", tmp_path / "out")
+    done = umf("replay", mini_bag, "--config", config, "--odometry", "none", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "the pose graph is skipped" in done.stdout
     summary = json.loads((tmp_path / "out" / "latest" / "summary.json").read_text())

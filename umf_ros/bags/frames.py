@@ -28,7 +28,7 @@ from umf_ros.sensors.tf import MOVING_TOPIC, BodyFrames, StaticTransforms, const
 
 _log = logging.getLogger(__name__)
 
-IMU_HINT = "; an IMU is no odometry: run one (KISS-ICP, Basalt, FAST-LIO) and give its poses with --odometry FILE.tum"
+IMU_HINT = "; an IMU is no odometry: leave topics.odometry empty for that of the scans, or give --odometry FILE.tum"
 
 
 class FrameReader:

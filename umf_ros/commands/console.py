@@ -42,6 +42,19 @@ class FrameProgress(Progress):
         self.update(self._frames, completed=done, found=found)
 
 
+class ScanProgress(Progress):
+    """Progress of an engine that makes odometry from scans."""
+
+    def __init__(self, console: Console) -> None:
+        columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
+        super().__init__(*columns, console=console, transient=True)
+        self._scans = self.add_task("Odometry of the scans", total=1.0)
+
+    def show(self, done: float) -> None:
+        """Advance to the processed share of the recording, 0 to 1."""
+        self.update(self._scans, completed=done)
+
+
 def _in_graph(counts: Mapping[str, int]) -> str:
     """Return counts such as " (30 in the graph, 4 pending)"."""
     rejected = counts.get("rejected", 0) + counts.get("refused", 0)

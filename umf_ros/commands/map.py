@@ -28,7 +28,9 @@ RayAddress = Annotated[
 MapPath = Annotated[Path, typer.Option("--out", help="Folder of the map, new or one to add to.")]
 OdometryFolder = Annotated[
     Path | None,
-    typer.Option("--odometry", help="Folder of TUM files named like the recordings, where these have no odometry."),
+    typer.Option(
+        "--odometry", help="Folder of TUM files named like the recordings; else their own, or that of the scans."
+    ),
 ]
 
 

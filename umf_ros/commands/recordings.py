@@ -5,21 +5,26 @@ A file that is missing raises a `BagError`, a `ConfigError` or an `UmfError` bef
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from umf_ros.core.errors import BagError, ConfigError, UmfError, either
-from umf_ros.core.resources import dataset_names
+from umf_ros.core.resources import MADE_ODOMETRY, dataset_names
+from umf_ros.core.resources import ODOMETRY_ENGINES as ENGINES
 from umf_ros.embedding import choices
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from rich.console import Console
+
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.reader import Bag
     from umf_ros.core.config import Settings
+    from umf_ros.core.trajectory import Trajectory
 
 BagPath = Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")]
 ConfigPath = Annotated[Path | None, typer.Option("--config", help="Parameter file (YAML).")]
@@ -28,6 +33,14 @@ EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"Embedding
 WeightsPath = Annotated[Path | None, typer.Option("--weights", help="Weights file; default: umf_scene.")]
 OdometryPath = Annotated[
     Path | None, typer.Option("--odometry", help="Odometry as a TUM file, where the recording has none.")
+]
+OdometryChoice = Annotated[
+    str | None,
+    typer.Option(
+        "--odometry",
+        metavar="FILE|ENGINE",
+        help="Odometry as a TUM file, or vgicp: that of the scans, the default where the recording has none; or none.",
+    ),
 ]
 OdometryFrame = Annotated[
     str,
@@ -87,6 +100,79 @@ def check_odometry_options(odometry: Path | None, odometry_frame: str) -> str:
     if odometry_frame and odometry is None:
         raise ConfigError("--odometry-frame is the frame of the poses in an --odometry file: give both")
     return odometry_frame or "body"
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenOdometry:
+    """Odometry of a replay by its `--odometry`.
+
+    Attributes:
+        path: TUM file of its poses; None for an engine.
+        frame: of the poses in the file.
+        engine: that is to be run on the scans; empty where a file or none is wanted.
+        is_wanted: whether the user named the engine, which is else used where the recording has no odometry.
+    """
+
+    path: Path | None
+    frame: str
+    engine: str = ""
+    is_wanted: bool = False
+
+    @classmethod
+    def parse(cls, choice: str | None, frame: str) -> ChosenOdometry:
+        """Return the choice of `--odometry` and `--odometry-frame`; raise a `ConfigError` if they do not fit."""
+        if choice == "none":
+            check_odometry_options(None, frame)
+            return cls(None, "body")
+        if choice is None or (choice in ENGINES and not Path(choice).exists()):
+            check_odometry_options(None, frame)
+            return cls(None, "body", choice or ENGINES[0], choice is not None)
+        return cls(Path(choice), check_odometry_options(Path(choice), frame))
+
+    def read(
+        self, console: Console, recording: Bag, settings: Settings, made: Path | None, warn: Callable[[str], None]
+    ) -> Trajectory | None:
+        """Return the odometry of the file, or of the scans where that is wanted or the recording has none, else None.
+
+        `made` is the file of an earlier run of the engine on this recording, where there is one; `warn` takes the
+        reason why the default engine fails.
+
+        Raises:
+            BagError: the file cannot be read, or an engine fails that the user named.
+        """
+        from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
+        from umf_ros.bags.trajectories import read_odometry, read_tum
+        from umf_ros.commands.console import ScanProgress
+        from umf_ros.core.config import topics_of
+
+        if self.path is not None:
+            return read_odometry(self.path, self.frame, settings)
+        if not self.engine or not (self.is_wanted or can_track(recording, settings)):
+            return None
+        told: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
+        console.print(f"odometry: {self.engine} on the scans of {topics_of(settings).cloud}", **told)
+        if made is not None and made.is_file():
+            return read_tum(made)
+        try:
+            with ScanProgress(console) as progress:
+                return odometry_of_scans(recording, settings, self.engine, progress.show)
+        except BagError as error:
+            if self.is_wanted:
+                raise
+            warn(f"no odometry: {error}")
+            return None
+
+    def keep(self, folder: Path, made: Trajectory | None) -> dict[str, str] | None:
+        """Write poses `made` by an engine to a run folder; return the entry `odometry_file` of its summary."""
+        from umf_ros.core.trajectory import write_tum
+
+        if self.path is not None:
+            return {"path": str(self.path.resolve()), "frame": self.frame}
+        if made is None:
+            return None
+        path = (folder / MADE_ODOMETRY).resolve()
+        write_tum(path, made)
+        return {"path": str(path), "frame": "body", "engine": self.engine}
 
 
 def open_frames(

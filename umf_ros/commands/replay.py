@@ -37,7 +37,7 @@ def command(
     dataset: options.DatasetName = "auto",
     embedder: options.EmbedderName = None,
     weights: options.WeightsPath = None,
-    odometry: options.OdometryPath = None,
+    odometry: options.OdometryChoice = None,
     odometry_frame: options.OdometryFrame = "",
     ground_truth: options.TruthPath = None,
     min_probability: MinProbability = None,
@@ -53,9 +53,9 @@ def command(
     Exit status 3: the inputs could not give any result.
     """
     options.refuse_unused("a mapping run", {"--map": mode == "mapping" and map_folder})
-    options.check_files(bag, config, odometry, ground_truth)
+    chosen = options.ChosenOdometry.parse(odometry, odometry_frame)
+    options.check_files(bag, config, chosen.path, ground_truth)
     options.check_map(map_folder)
-    odometry_frame = options.check_odometry_options(odometry, odometry_frame)
 
     recording, settings = options.open_recording(
         bag,
@@ -73,9 +73,11 @@ def command(
     starting = ThreadPoolExecutor(1, "start").submit(make_detector_embedder, settings)
     from rich.console import Console
 
+    from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.inputs import absent_inputs, input_counts
     from umf_ros.bags.trajectories import read_ground_truth
     from umf_ros.commands.console import WARNING, FrameProgress, stop_on_interrupt, undisturbed
+    from umf_ros.core.resources import MADE_ODOMETRY
     from umf_ros.core.watchdog import watching
     from umf_ros.replay import Replay
     from umf_ros.runs.reader import read_run, remember_recording
@@ -86,20 +88,23 @@ def command(
     console = Console()
     _tell_inputs(console, settings)
     warnings: list[str] = []
-    reader = options.open_frames(recording, settings, partial(_warn, console, warnings), odometry, odometry_frame)
-    truth = read_ground_truth(None, ground_truth)
+    warn = partial(_warn, console, warnings)
     if settings.localizing:
         options.refuse_unused("a localising run", {"--rerun": rerun, "--resume": resume})
+    truth = read_ground_truth(None, ground_truth)
+    unfinished = unfinished_folder(out, bag, settings) if resume else None
+    path = chosen.read(console, recording, settings, unfinished and unfinished / MADE_ODOMETRY, warn)
+    reader = FrameReader(recording, settings, path, warn=warn)
     network = starting.result()
     viewer = RerunLog(rerun, settings.terrain) if rerun else None
     # a store or a map that cannot be used is reported before there is a folder
     known = settings.database.path or (settings.localizing and not settings.grows_map)
     detector = LoopDetector(settings, network) if known else None
-    unfinished = unfinished_folder(out, bag, settings) if resume else None
     folder = unfinished or create_folder(out, bag)
+    known_odometry = chosen.keep(folder, path)
     detector = detector or LoopDetector(with_places(settings, folder), network)
     del network, starting  # only the detector keeps the network, until it is closed: the report needs the memory
-    absent = [one.line for one in absent_inputs(recording, settings, odometry is not None)]
+    absent = [one.line for one in absent_inputs(recording, settings, path is not None)]
     for line in absent:
         console.print(line, **WARNING)
     replay = Replay(folder, settings, detector, unfinished is not None)
@@ -129,7 +134,7 @@ def command(
             sensors=sensors.as_json(),
             warnings=warnings,
             interrupted=bool(interrupted()),
-            odometry_file={"path": str(odometry.resolve()), "frame": odometry_frame} if odometry else None,
+            odometry_file=known_odometry,
         )
         if settings.localizing:
             status = _report_localization(console, folder, replay.counts, newest)

@@ -95,6 +95,7 @@ class Frame:
         image_stamp_ns: exposure of the left image.
         session: counts the resets of the clock or the odometry.
         motion: during the scan; None where it was not removed, without odometry or times per point.
+        offsets_s: (N,) float32, s from `stamp_ns` to each point where motion was not removed; None without times.
     """
 
     stamp_ns: int
@@ -109,6 +110,7 @@ class Frame:
     image_stamp_ns: int | None = None
     session: int = 0
     motion: ScanMotion | None = None
+    offsets_s: Points | None = None
 
 
 @dataclass(frozen=True, slots=True)

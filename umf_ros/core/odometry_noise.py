@@ -15,7 +15,7 @@ from umf_ros.core.geometry import Array
 _M_PER_RAD, _M_PER_S = 0.5, 1e-4
 # by hand: a step is a jump if it exceeds the speed of the steps before by as much again, an acceleration (rad/s^2,
 # m/s^2) during it, and `LEAST_JUMP`
-_ACCELERATION = np.array([np.deg2rad(300.0), 5.0])
+ACCELERATION = np.array([np.deg2rad(300.0), 5.0])
 LEAST_JUMP = np.array([np.deg2rad(5.0), 0.3])
 """Shorter steps are no jumps, rad and m."""
 STEPS_BEFORE = 9
@@ -38,7 +38,7 @@ def jump_excess(lengths: Array, seconds: ArrayLike, speeds: Array) -> Array:
     elapsed_s = np.asarray(seconds)[..., None]
     usual = np.median(speeds, axis=-1) * elapsed_s
     too_long = lengths - usual
-    return np.where(too_long > LEAST_JUMP + usual + _ACCELERATION * elapsed_s**2, too_long, 0.0)
+    return np.where(too_long > LEAST_JUMP + usual + ACCELERATION * elapsed_s**2, too_long, 0.0)
 
 
 @dataclass(frozen=True)

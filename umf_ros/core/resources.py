@@ -13,6 +13,10 @@ LAB_PACKAGES = {"nncf": ("nncf", "3.4"), "open3d": ("open3d", "0.19"), "sklearn"
 """Optional packages: distribution and first version known to work, by module."""
 FLEET_PACKAGES = ("pgvector", "psycopg", "ray")
 """Modules that only a rover of a fleet or a cluster needs."""
+ODOMETRY_ENGINES = ("vgicp",)
+"""Engines that make odometry from scans, by the names of `umf_ros.sensors.scan_odometry.ENGINES`; the default first."""
+MADE_ODOMETRY = "odometry.tum"
+"""Poses of an engine in the folder of a run."""
 
 
 def share_folders() -> list[Path]:

@@ -15,6 +15,7 @@ A recording or map that cannot be read raises an `UmfError`, a folder that canno
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
@@ -28,13 +29,15 @@ import numpy as np
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
-from umf_ros.bags.trajectories import read_odometry
+from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
+from umf_ros.bags.trajectories import read_odometry, read_tum
 from umf_ros.core.config import Database, Settings, Verification
 from umf_ros.core.errors import BagError, UmfError, writing
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.core.io import lock_file, write_table
 from umf_ros.core.limits import read_json
-from umf_ros.core.trajectory import Trajectory
+from umf_ros.core.resources import MADE_ODOMETRY, ODOMETRY_ENGINES
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.maps.joint_graph import solve
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
@@ -44,12 +47,13 @@ from umf_ros.places.store import delete_sessions, stored_identity, stored_sessio
 from umf_ros.replay import Replay
 from umf_ros.runs.reader import describe_recording, remember_recording
 from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, closure_row
-from umf_ros.runs.writer import PLACES, count_drops
+from umf_ros.runs.writer import PLACES, begin_folder, count_drops, is_of, is_unfinished
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.submaps import SubmapFinder
 from umf_ros.submaps.history import SubmapHistory
 from umf_ros.verification import Hypothesis, Verifier
 
+_log = logging.getLogger(__name__)
 OnFrame = Callable[[float, Detection], None]
 """Called for every frame with the processed share of the recording, 0 to 1, and the detection."""
 _UNKNOWN = np.diag([np.inf] * 6)
@@ -63,7 +67,8 @@ class Opening:
     """Options that recordings are opened with, as in `umf replay`.
 
     Attributes:
-        odometry: folder of TUM files named like the recordings, `NAME.tum` or `NAME.odometry.tum`; None: none.
+        odometry: a TUM file, or a folder of files named like the recordings, `NAME.tum` or `NAME.odometry.tum`; None:
+            that of the recording, or of its scans.
         odometry_frame: frame whose poses the files hold.
     """
 
@@ -83,6 +88,8 @@ class Opening:
         """Return the odometry of a recording from its TUM file; None where there is none."""
         if self.odometry is None:
             return None
+        if self.odometry.is_file():
+            return read_odometry(self.odometry, self.odometry_frame, settings)
         for ending in (".tum", ".odometry.tum"):
             path = self.odometry / f"{recording.stem}{ending}"
             if path.is_file():
@@ -108,20 +115,21 @@ def _is_recording(path: Path) -> bool:
 
 
 def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: OnFrame = lambda *_: None) -> None:
-    """Replay one recording into a run folder, which replaces an earlier one.
+    """Replay one recording into a run folder; one of a process that was killed is continued.
 
-    The folder gets `places.sqlite`, stamped by the recording's own clock. `on_frame` is called for every frame.
+    Scans make the odometry where there is none. The folder gets `places.sqlite`, stamped by the recording's own clock.
+    `on_frame` is called for every frame.
     """
     bag = open_bag(recording)
     settings = opening.settings(bag)
-    if folder.exists():
-        rmtree(folder)
-    with writing(f"to {folder}"):
-        folder.mkdir(parents=True)
     store = Database(path=str(folder / PLACES), cached_keyframes=settings.database.cached_keyframes)
     settings = settings.model_copy(update={"database": store})
-    reader = FrameReader(bag, settings, opening.odometry_of(recording, settings))
-    replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
+    resume = is_unfinished(folder, recording) and is_of(folder, settings)
+    if not resume:
+        rmtree(folder, ignore_errors=True)
+        begin_folder(folder, recording)
+    reader = FrameReader(bag, settings, _odometry(bag, opening, settings, folder))
+    replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)), resume)
     for detection in replay.run(reader.stream()):
         on_frame(reader.progress, detection)
     has_odometry = replay.finish(count_drops(reader.counters))
@@ -129,6 +137,22 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
     if not has_odometry:
         _track(folder, settings)
     replay.raise_if_frames_failed()
+
+
+def _odometry(bag: Bag, opening: Opening, settings: Settings, folder: Path) -> Trajectory | None:
+    """Return the odometry of a file, or of the scans where the recording has none, which is kept in the run folder."""
+    given, made = opening.odometry_of(bag.path, settings), folder / MADE_ODOMETRY
+    if given is not None or not can_track(bag, settings):
+        return given
+    if made.is_file():
+        return read_tum(made)
+    try:
+        found = odometry_of_scans(bag, settings, ODOMETRY_ENGINES[0])
+    except BagError as error:
+        _log.warning("no odometry: %s", error)
+        return None
+    write_tum(made, found)
+    return found
 
 
 def _track(folder: Path, settings: Settings) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from umf_ros import __version__
 from umf_ros.core.config import Settings, dump_settings, load_settings
-from umf_ros.core.errors import UmfError
+from umf_ros.core.errors import UmfError, writing
 from umf_ros.core.frames import Frame, Keyframe
 from umf_ros.core.geometry import Array, evenly, quantize
 from umf_ros.core.io import create_run_folder, memory_mb, write_atomically
@@ -51,8 +51,29 @@ PHOTO_WIDTH, PHOTO_QUALITY, SCAN_POINTS = 360, 60, 3000  # by hand: rocks stay r
 def create_folder(out: Path, bag: Path) -> Path:
     """Make a new folder inside `out` for a replay of `bag`."""
     folder = create_run_folder(out)
-    _note(folder, bag=str(bag.resolve()), finished=False)
+    begin_folder(folder, bag)
     return folder
+
+
+def begin_folder(folder: Path, bag: Path) -> None:
+    """Make `folder`, if it is missing, the one of an unfinished replay of `bag`."""
+    with writing(f"to {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
+    _note(folder, bag=str(bag.resolve()), finished=False)
+
+
+def is_unfinished(folder: Path, bag: Path) -> bool:
+    """Return whether `folder` holds an unfinished replay of `bag`."""
+    facts: dict[str, Any] = {}
+    with suppress(UmfError), closing(RunFile(folder, read_only=True)) as file:
+        facts = file.facts()
+    return facts.get("bag") == str(bag.resolve()) and not facts.get("finished")
+
+
+def is_of(folder: Path, settings: Settings) -> bool:
+    """Return whether a replay was started with these settings; one that was killed before its first row has none."""
+    path = folder / "config.yaml"
+    return not path.exists() or load_settings(path) == settings
 
 
 def unfinished_folder(out: Path, bag: Path, settings: Settings) -> Path | None:
@@ -62,13 +83,9 @@ def unfinished_folder(out: Path, bag: Path, settings: Settings) -> Path | None:
     """
     unfinished = [path.parent for path in sorted(out.glob(f"*/{NAME}"), reverse=True) if not path.parent.is_symlink()]
     for path in unfinished:
-        facts: dict[str, Any] = {}
-        with suppress(UmfError), closing(RunFile(path, read_only=True)) as file:
-            facts = file.facts()
-        if facts.get("bag") != str(bag.resolve()) or facts.get("finished"):
+        if not is_unfinished(path, bag):
             continue
-        # without settings, the process was killed before its first row
-        if (path / "config.yaml").exists() and load_settings(path / "config.yaml") != settings:
+        if not is_of(path, settings):
             raise UmfError(f"{path} was started with other settings; leave out --resume, or pass the same options")
         (path / "summary.json").unlink(missing_ok=True)  # of a run interrupted by Ctrl-C
         return path

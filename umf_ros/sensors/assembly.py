@@ -362,7 +362,7 @@ def assemble(
 ) -> Frame:
     """Build the frame at `anchor.stamp_ns`: images (H, W) uint8 rectified, motion between the measurements removed."""
     here = odometry.path(anchor.stamp_ns, anchor.stamp_ns).poses
-    points, intensity, motion = _scan(anchor, odometry, calibration, here)
+    points, intensity, motion, offsets_s = _scan(anchor, odometry, calibration, here)
     exposed = odometry.path(left.stamp_ns, left.stamp_ns).poses if left else here[:0]
     body_T_camera = calibration.body_T_camera
     if len(exposed) and len(here):  # at the exposure, in the body frame at the stamp
@@ -381,28 +381,33 @@ def assemble(
         image_stamp_ns=left.stamp_ns if left else None,
         session=session,
         motion=motion,
+        offsets_s=offsets_s,
     )
 
 
 def _scan(
     anchor: Anchor, odometry: OdometryBuffer, calibration: Calibration, here: Array
-) -> tuple[Points | None, Points | None, ScanMotion | None]:
+) -> tuple[Points | None, Points | None, ScanMotion | None, Points | None]:
     """Return points in the body frame at the anchor's key, their intensity, and the motion that was removed.
+
+    The last value is the times (N,) in s after the key of points whose motion is unknown, else None.
 
     `here` is `path_T_body` at the key, (1, 4, 4), or (0, 4, 4) where it is unknown.
     """
     cloud = anchor.cloud
     if cloud is None or not len(cloud.points):
-        return None, None, None
+        return None, None, None, None
     points = transform(calibration.body_T_lidar, cloud.points)
-    motion = None
-    if len(here) and cloud.time_offset_ns is not None:
+    motion = offsets_s = None
+    if cloud.time_offset_ns is not None:
+        stamps = anchor.measured_ns + cloud.time_offset_ns
         path = odometry.path(*anchor.span_ns())
-        if len(path):
-            stamps = anchor.measured_ns + cloud.time_offset_ns
+        if len(here) and len(path):
             points = deskew(points, stamps, path, here[0])
             motion = scan_motion((stamps - anchor.stamp_ns) * 1e-9, anchor.span_ns(), path, odometry)
-    return points, cloud.intensity, motion
+        else:
+            offsets_s = ((stamps - anchor.stamp_ns) * 1e-9).astype(np.float32)
+    return points, cloud.intensity, motion, offsets_s
 
 
 def deskew(points: Points, point_stamps_ns: NDArray[np.int64], path: Trajectory, path_T_body: Array) -> Points:

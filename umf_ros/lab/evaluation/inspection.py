@@ -165,7 +165,11 @@ def _about_odometry(bag: Bag, found: Inspected) -> Iterator[Advice]:
     if not found.topics.odometry:
         imu = [topic for topic, info in bag.topics.items() if info.type == "sensor_msgs/msg/Imu"]
         also = f"; {imu[0]} is an IMU, which is no odometry" if imu else ""
-        remedy = "run one (KISS-ICP on the scans, Basalt on the images) and give its poses with --odometry FILE.tum"
+        if found.topics.cloud:
+            what = f"no odometry{also}: umf replay, umf slam and umf map make it from {found.topics.cloud} (vgicp)"
+            yield Advice("note", what, "--odometry FILE.tum takes that of another system")
+            return
+        remedy = "run one (Basalt on the images) and give its poses with --odometry FILE.tum"
         yield Advice("warning", f"no odometry: closures only, the pose graph is skipped{also}", remedy)
 
 

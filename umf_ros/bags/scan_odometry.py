@@ -1,0 +1,89 @@
+"""Odometry of a recording without odometry, from its scans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain, islice
+
+import numpy as np
+
+from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.reader import Bag
+from umf_ros.core.config import EmbeddingSettings, Settings, topics_of
+from umf_ros.core.errors import BagError
+from umf_ros.core.frames import Frame
+from umf_ros.core.trajectory import Trajectory
+from umf_ros.sensors.scan_odometry import ENGINES, ScanOdometry
+
+MAX_LOST = 0.05
+"""Share of scans that may not fit the motion before them (*by hand*: .01 on good drives, .5 where track is lost)."""
+FIRST, FEWEST_POINTS = 5, 100
+"""Scans that tell the velocity at the start, and returns of a scan that is used."""
+
+
+def can_track(bag: Bag, settings: Settings) -> bool:
+    """Return whether a recording has scans on the expected topic, and no odometry."""
+    topics = topics_of(settings)
+    counts = {name: bag.topics[name].count if name in bag.topics else 0 for name in (topics.cloud, topics.odometry)}
+    return bool(counts[topics.cloud]) and not counts[topics.odometry]
+
+
+def odometry_of_scans(
+    bag: Bag, settings: Settings, engine: str, on_scan: Callable[[float], None] = lambda _: None
+) -> Trajectory:
+    """Return poses of the body at the scans of the first session of a recording.
+
+    Args:
+        bag: the recording.
+        settings: those of the replay; its topic of the odometry is left out.
+        engine: a name of `ENGINES`.
+        on_scan: called for every scan with the processed share of the recording, 0 to 1.
+
+    The velocity at the first scan is that of the first few, registered once more: it removes the motion from the scan
+    that the map begins with.
+
+    Raises:
+        BagError: there are no scans, they come too slowly, or the engine lost track.
+    """
+    topics = topics_of(settings)
+    if topics.cloud not in bag.topics:
+        raise BagError(f"{bag.path} has no scans for --odometry {engine}")
+    names = {name: "" for name in topics.model_dump() if name != "cloud"}
+    alone = {"topics": topics.model_copy(update=names), "embedding": EmbeddingSettings()}
+    reader = FrameReader(bag, settings.model_copy(update=alone), warn=lambda _: None)
+    scans = _first_session(reader)
+    first = list(islice(scans, FIRST))
+    trial = ScanOdometry(ENGINES[engine]())
+    for frame in first:
+        trial.add(frame)
+    odometry = ScanOdometry(ENGINES[engine](), trial.twist)
+    for frame in chain(first, scans):
+        odometry.add(frame)
+        on_scan(reader.progress)
+    if len(odometry.samples) < FIRST:
+        raise BagError(f"{bag.path} has no scans that follow each other: --odometry {engine} needs them")
+    _check(engine, odometry, settings.sync.max_odometry_gap_s)
+    return odometry.trajectory()
+
+
+def _first_session(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Yield the frames with points until the clock is set back."""
+    session: int | None = None
+    for frame in frames:
+        session = frame.session if session is None else session
+        if frame.session != session:
+            return
+        if frame.points is not None and len(frame.points) >= FEWEST_POINTS:
+            yield frame
+
+
+def _check(engine: str, odometry: ScanOdometry, max_gap_s: float) -> None:
+    stamps_ns = [one.stamp_ns for one in odometry.samples]
+    period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
+    if period_s > max_gap_s:
+        raise BagError(f"{engine} cannot follow scans that are {period_s:.1f} s apart: record odometry")
+    lost = len(odometry.lost_ns)
+    if lost > max(1, MAX_LOST * len(stamps_ns)):
+        what = f"{engine} lost track of the scans {(odometry.lost_ns[0] - stamps_ns[0]) * 1e-9:.1f} s after the start"
+        share = f"{lost} of {len(stamps_ns)} do not fit the motion before them"
+        raise BagError(f"{what} ({share}); it sees too little or moves too far: use --odometry FILE.tum")
