@@ -205,10 +205,10 @@ class SessionClock:
 
 def _is_part(one: StampedInput, other: StampedInput) -> bool:
     """Return whether two messages of one stamp are different parts of a scan, and not the same message twice."""
-    points = [getattr(message.value, "points", None) for message in (one, other)]
-    if one.stamp_ns != other.stamp_ns or points[0] is None or points[1] is None:
+    before, after = (getattr(message.value, "points", None) for message in (one, other))
+    if one.stamp_ns != other.stamp_ns or before is None or after is None:
         return False
-    return not np.array_equal(*points)
+    return not np.array_equal(before, after)
 
 
 def _goes_on(held: _Held, found: _Held, arrival: StampedInput) -> bool:

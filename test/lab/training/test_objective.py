@@ -53,7 +53,7 @@ class ExponentObjective(Objective):
     def forward(self, batch):
         return {"total": (self.network.fusion.image_pool.exponent - batch.value).square()}
 
-    def judge(self, step, folder):
+    def judge(self, step):
         return Judgement(stop=step >= 4, figures={"exponent": self.network.fusion.image_pool.exponent.item()})
 
     def card(self):
