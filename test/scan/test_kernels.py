@@ -162,7 +162,7 @@ def test_rays_tell_of_points_what_range_images_do(merged: tuple[list[Array], Arr
 def test_misfits_are_those_of_points_and_planes(scan: Array, merged: tuple[list[Array], Array]) -> None:
     scans, poses = merged
     space = kernels.FreeSpace([kernels.RangeImage(one, *RULES) for one in scans], poses)
-    points = np.ascontiguousarray(thinned(room(1)[1::2])[::4])
+    points = np.ascontiguousarray(thinned(room(1)[1::2])[::20])
     reach = np.random.default_rng(4).uniform(0.05, 0.4, len(points))
     tried = np.stack([np.eye(4), POSE, make_pose(np.eye(3), [2.0, 0, 0])])
     tree = kernels.KdTree(scan)
