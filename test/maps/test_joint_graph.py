@@ -13,7 +13,7 @@ from umf_ros.core.config import Settings
 from umf_ros.core.geometry import from_enu, make_pose, to_enu, transform
 from umf_ros.localizer import read_poses
 from umf_ros.maps.joint_graph import JointMap, solve
-from umf_ros.maps.outputs import write_results
+from umf_ros.maps.outputs import sentence, write_results
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.run_file import RunFile
 from umf_ros.runs.truth import absolute_trajectory_error
@@ -100,6 +100,8 @@ def test_results_are_listed_by_session(tmp_path: Path) -> None:
     summary = write_results(folder, joint)
     assert json.loads((folder.path / "summary.json").read_text()) == summary
     assert summary["joined"] == 2 and summary["closures_between"]["accepted"] == 3
+    within = summary["closures_within"] | {"found": 9, "accepted": 8}
+    assert sentence({"sessions": [{}], "closures_within": within}) == "one session; 8 of 9 closures accepted"
     assert [one["graph_sessions"] for one in summary["sessions"]] == [[0], [1]]
     with (folder.path / "graph.csv").open() as file:
         sessions = [row["session"] for row in csv.DictReader(file)]

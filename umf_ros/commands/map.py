@@ -247,13 +247,11 @@ def _print_summary(out: Path, summary: dict[str, Any], console: Console) -> None
     from umf_ros.maps.outputs import crispness, sentence
 
     for one in summary["sessions"]:
-        tied = f"{one['closures_between']} ends of closures with others"
-        joined = f"joined by {tied}" if one["joined"] else "not joined: no accepted closure with the map yet"
+        told = f"joined by {one['closures_between']} ends of closures with others"
+        told = told if one["joined"] else "not joined: no accepted closure with the map yet"
         size = f"{one['places']} places, {one['length_m']:.0f} m" + ("" if one["odometry"] else ", no odometry")
-        console.print(f"  {one['name']}: {size}; {joined}", markup=False, soft_wrap=True)
-    console.print(f"{out}: {sentence(summary)}", markup=False, soft_wrap=True)
-    if line := crispness(summary):
-        console.print(line)
-    if ground := summary.get("ground"):
-        console.print(f"{out}: {ground}", markup=False, soft_wrap=True)
-    console.print(f"{out / 'report.html'}", markup=False, soft_wrap=True)
+        told = f"; {told}" if len(summary["sessions"]) > 1 else ""
+        console.print(f"  {one['name']}: {size}{told}", markup=False, soft_wrap=True)
+    files = f"{out}: {summary['ground']}" if summary.get("ground") else ""
+    for line in filter(None, (f"{out}: {sentence(summary)}", crispness(summary), files, f"{out / 'report.html'}")):
+        console.print(line, markup=False, soft_wrap=True)

@@ -90,7 +90,9 @@ def summarise(joint: JointMap) -> dict[str, Any]:
 
 
 def sentence(summary: dict[str, Any]) -> str:
-    """Return a sentence on joined sessions and closures between them."""
+    """Return a sentence on joined sessions and closures between them; of a single one, on its own closures."""
+    if len(summary["sessions"]) == 1:
+        return "one session; {accepted} of {found} closures accepted".format_map(summary["closures_within"])
     between, joined = summary["closures_between"], f"{summary['joined']} of {len(summary['sessions'])} sessions"
     return f"{joined} in one frame; closures between them: {between['accepted']} of {between['found']} accepted"
 
