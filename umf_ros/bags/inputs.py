@@ -78,11 +78,8 @@ def absent_inputs(bag: Bag, settings: Settings, odometry_from_file: bool = False
 def _remedy(name: str, bag: Bag) -> str:
     others = sorted(topic for topic, info in bag.topics.items() if info.type in TYPES[name] and info.count)
     if name == "odometry":
-        return (
-            f"set topics.odometry ({', '.join(others)})"
-            if others
-            else "--odometry FILE.tum supplies it, or vgicp on scans"
-        )
+        supplied = "--odometry FILE.tum supplies it, or vgicp on scans"
+        return f"set topics.odometry ({', '.join(others)})" if others else supplied
     if not others:
         return f"the recording has no {TYPES[name][0]} at all"
     return f"set topics.{name} in a --config ({', '.join(others)})"

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain, islice
+from pathlib import Path
 
 import numpy as np
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import Bag
+from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.config import EmbeddingSettings, Settings, topics_of
 from umf_ros.core.errors import BagError
 from umf_ros.core.frames import Frame
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.scan_odometry import ENGINES, ScanOdometry
 
+OnScan = Callable[[float], None]
 MAX_LOST = 0.05
 """Share of scans that may not fit the motion before them (*by hand*: .01 on good drives, .5 where track is lost)."""
 FIRST, FEWEST_POINTS = 5, 100
@@ -29,7 +32,7 @@ def can_track(bag: Bag, settings: Settings) -> bool:
 
 
 def odometry_of_scans(
-    bag: Bag, settings: Settings, engine: str, on_scan: Callable[[float], None] = lambda _: None
+    bag: Bag, settings: Settings, engine: str, made: Path | None = None, on_scan: OnScan = lambda _: None
 ) -> Trajectory:
     """Return poses of the body at the scans of the first session of a recording.
 
@@ -37,6 +40,7 @@ def odometry_of_scans(
         bag: the recording.
         settings: those of the replay; its topic of the odometry is left out.
         engine: a name of `ENGINES`.
+        made: TUM file of an earlier run, which is read instead where it exists.
         on_scan: called for every scan with the processed share of the recording, 0 to 1.
 
     The velocity at the first scan is that of the first few, registered once more: it removes the motion from the scan
@@ -45,6 +49,8 @@ def odometry_of_scans(
     Raises:
         BagError: there are no scans, they come too slowly, or the engine lost track.
     """
+    if made is not None and made.is_file():
+        return read_tum(made)
     topics = topics_of(settings)
     if topics.cloud not in bag.topics:
         raise BagError(f"{bag.path} has no scans for --odometry {engine}")

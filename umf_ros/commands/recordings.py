@@ -141,7 +141,7 @@ class ChosenOdometry:
             BagError: the file cannot be read, or an engine fails that the user named.
         """
         from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
-        from umf_ros.bags.trajectories import read_odometry, read_tum
+        from umf_ros.bags.trajectories import read_odometry
         from umf_ros.commands.console import ScanProgress
         from umf_ros.core.config import topics_of
 
@@ -151,11 +151,9 @@ class ChosenOdometry:
             return None
         told: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
         console.print(f"odometry: {self.engine} on the scans of {topics_of(settings).cloud}", **told)
-        if made is not None and made.is_file():
-            return read_tum(made)
         try:
             with ScanProgress(console) as progress:
-                return odometry_of_scans(recording, settings, self.engine, progress.show)
+                return odometry_of_scans(recording, settings, self.engine, made, progress.show)
         except BagError as error:
             if self.is_wanted:
                 raise

@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,11 @@ Image = NDArray[np.uint8]
 Points = NDArray[np.float32]
 WORDS_WEIGHT = 0.54
 """Cosine similarity of the network that one unit of the similarity by words is worth (`umf_ros.lab.fit.words`)."""
+
+
+def combine(similarity: Any, words: Any) -> Any:
+    """Return similarities by the network and by words as one, in the unit of the network's."""
+    return similarity + WORDS_WEIGHT * words
 
 
 class State(StrEnum):
@@ -217,7 +223,7 @@ class Candidate:
     @property
     def combined(self) -> float:
         """Both similarities as one, in the unit of the cosine similarity."""
-        return self.similarity + WORDS_WEIGHT * self.words
+        return combine(self.similarity, self.words)
 
 
 @dataclass(frozen=True, slots=True)

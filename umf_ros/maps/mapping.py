@@ -30,7 +30,7 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
-from umf_ros.bags.trajectories import read_odometry, read_tum
+from umf_ros.bags.trajectories import read_odometry
 from umf_ros.core.config import Database, Settings, Verification
 from umf_ros.core.errors import BagError, UmfError, writing
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
@@ -144,10 +144,8 @@ def _odometry(bag: Bag, opening: Opening, settings: Settings, folder: Path) -> T
     given, made = opening.odometry_of(bag.path, settings), folder / MADE_ODOMETRY
     if given is not None or not can_track(bag, settings):
         return given
-    if made.is_file():
-        return read_tum(made)
     try:
-        found = odometry_of_scans(bag, settings, ODOMETRY_ENGINES[0])
+        found = odometry_of_scans(bag, settings, ODOMETRY_ENGINES[0], made)
     except BagError as error:
         _log.warning("no odometry: %s", error)
         return None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.config import Database, Loop
 from umf_ros.core.errors import OutputError, UmfError, one_line
-from umf_ros.core.frames import WORDS_WEIGHT, Candidate, Keyframe, Points
+from umf_ros.core.frames import Candidate, Keyframe, Points, combine
 from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import atomic_write
 from umf_ros.core.limits import read_json
@@ -174,7 +174,7 @@ class PlaceDatabase:
         for wanted in (2 * rules.top_k, WIDER * rules.top_k):
             rows = np.sort(self.index.search(descriptor, wanted + MARGIN, admissible))
             similarity, words = self.store.descriptors(rows) @ descriptor, self._compare_words(keyframe, rows)
-            order = np.argsort(-(similarity + WORDS_WEIGHT * words), kind="stable")[:wanted]  # equal ones by row
+            order = np.argsort(-combine(similarity, words), kind="stable")[:wanted]  # equal ones by row
             order = order[similarity[order] >= rules.min_similarity]
             similar = [(int(rows[i]), float(similarity[i])) for i in order]
             alike = dict(zip(rows.tolist(), words.tolist(), strict=True))

@@ -224,8 +224,8 @@ class OutlierRejection:
         if not self.settings.reject_outliers:
             return agreed
         pending = self._of(State.PENDING) & np.array(self._joined, bool)
-        places = {row: [row, *self._consistency.companions(row, pending)] for row in agreed}
-        return [row for row, place in places.items() if not self._is_outnumbered([row], place, pending)]
+        places = ([row, *self._consistency.companions(row, pending)] for row in agreed)
+        return [place[0] for place in places if not self._is_outnumbered(place[:1], place, pending)]
 
     def _take(self, placed: PlacedClosure) -> int:
         row = len(self.placed)
@@ -397,9 +397,9 @@ class OutlierRejection:
 
     def _is_outnumbered(self, rows: list[int], place: list[int], pending: NDArray[np.bool_]) -> bool:
         """Return whether a likely place among pending closures, with as many of them as a place, opposes some of it."""
-        ratios = np.array(self._ratios)
-        likely = pending & (ratios < _RIVAL_RATIO * np.median(ratios[place]))
-        rivals = {rival for row in rows for rival in self._consistency.opponents(row, likely)}
+        most = _RIVAL_RATIO * np.median([self._ratios[row] for row in place])
+        opponents = {other for row in rows for other in self._consistency.opponents(row, pending)}
+        rivals = (other for other in opponents if self._ratios[other] < most)
         return any(len(self._consistency.companions(rival, pending)) + 1 >= len(place) for rival in rivals)
 
     def _odds_against(self, place: list[int], at_last: bool) -> Array:

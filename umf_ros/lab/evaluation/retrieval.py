@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.config import Loop, Verification
-from umf_ros.core.frames import WORDS_WEIGHT, Candidate, Embedding, Frame, Keyframe
+from umf_ros.core.frames import Candidate, Embedding, Frame, Keyframe, combine
 from umf_ros.core.geometry import Array
 from umf_ros.embedding import Embedder
 from umf_ros.lab.datasets.sample import Rule, distances, label, places_of
@@ -310,7 +310,7 @@ def word_similarity(queries: Sequence[Keyframe], references: Sequence[Keyframe])
 def with_words(similarity: Array, words: Array, queries: Sequence[Keyframe]) -> Array:
     """(Q, R) both similarities for queries without a scan, the network's for the others: those of a place database."""
     without_scan = np.array([one.embedding.cloud is None for one in queries])
-    combined: Array = similarity + WORDS_WEIGHT * words * without_scan[:, None]
+    combined: Array = combine(similarity, words * without_scan[:, None])
     return combined
 
 
