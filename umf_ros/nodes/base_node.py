@@ -45,7 +45,7 @@ ODOMETRY_DEPTH = 200
 BURST = 500
 """Messages of a rare input that are received at once."""
 WATCH_S = 1.0
-HEARTBEAT_S = 0.05
+HEARTBEAT_S = 0.1
 FAULT_S = 10.0
 """Time after a fault until it leaves the status of the node."""
 CLOCK_PATIENCE_S = 30.0

@@ -185,9 +185,11 @@ def _delay(climb: Array, stereo: Array, waited_s: float) -> Array | None:
         waited_s: between the left images.
     """
     kept = (stereo[:, 0] < 1) & (np.abs(stereo[:, 1]) < MAX_CLIMB_PX)
-    if kept.sum() < MIN_CORNERS:
+    if kept.sum() < MIN_CORNERS or waited_s <= 0:
         return None
     rate, height, weights = climb[kept] / waited_s, stereo[kept, 1], np.ones(kept.sum())
+    if not np.ptp(rate):  # the same image twice, as of a parked rover in a simulator
+        return None
     for _ in range(ROUNDS):
         delay, offset = np.polyfit(rate, height, 1, w=np.sqrt(weights))
         misfits = np.abs(height - delay * rate - offset)
@@ -334,6 +336,8 @@ def _impossible_axes(seen: Array, stated: Array) -> tuple[Array, bool | None] | 
     weights = fits[0].weights / scales**2
     information = np.einsum("kn,kni,kni->", weights, stated, stated) * np.eye(3)
     information -= np.einsum("kn,kni,knj->ij", weights, stated, stated)
+    if not np.trace(information) > 0:  # the sensor sends the same again and again
+        return None
     allowed = -np.inf
     for damping in (*np.trace(information) * np.geomspace(1e-9, 1e3, 13), np.inf):  # towards the identity
         near = np.linalg.solve(information / damping + np.eye(3), information / damping @ turn)
