@@ -113,7 +113,6 @@ def _about(joint: JointMap, one: JointSession, ties: int) -> dict[str, Any]:
     return {
         "name": session.name,
         "recording": session.recording["path"],
-        "odometry": session.odometry,
         "places": session.places,
         "places_in_map": len(one.stamps),
         "joined": one.joined,

@@ -79,18 +79,10 @@ class Cloud:
 
 
 class OdometrySample(NamedTuple):
-    """An odometry message, or the tracked pose of a keyframe of a recording without odometry.
-
-    Attributes:
-        stamp_ns: of the pose.
-        odom_T_body: (4, 4).
-        covariance: None for a message; (6, 6) of the motion since the previous tracked pose in ROS order, axes of the
-            previous body, infinite where the motion is unknown and a session begins.
-    """
+    """An odometry message: its stamp, and the pose (4, 4)."""
 
     stamp_ns: int
     odom_T_body: Array
-    covariance: Array | None = None
 
 
 def stamp_ns(message: Any) -> int:
