@@ -236,11 +236,6 @@ def _record_type(fields: list[Any], point_step: int, order: str) -> np.dtype[Any
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": point_step})
 
 
-def decode_odometry(message: Any) -> OdometrySample:
-    """Return the pose of a nav_msgs/Odometry; raises as `decode_pose`."""
-    return OdometrySample(stamp_ns(message), decode_pose(message.pose.pose))
-
-
 def decode_pose(pose: Any) -> Array:
     """Return (4, 4) matrix of a geometry_msgs/Pose.
 
