@@ -13,9 +13,8 @@ import yaml
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.reader import message_types
 from umf_ros.core.config import Topics
-from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
-from umf_ros.core.io import write_atomically
+from umf_ros.core.io import check_absent, write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.lab.scan_files import SensorFileError, read_image
 from umf_ros.lab.simulation.bag_writer import BagWriter, image_message, pose_message
@@ -62,13 +61,6 @@ class Imported:
         if not self.left and not self.scans:
             raise SensorFileError(f"{source} holds neither images nor scans of this format")
         return self
-
-
-def check_absent(*paths: Path) -> None:
-    """Raise an `OutputError` if one of some files, which a person may have changed, would be overwritten."""
-    for path in paths:
-        if path.exists():
-            raise OutputError(f"{path} is there already: nothing was written")
 
 
 def pose_entry(pose: Array) -> dict[str, list[float]]:

@@ -83,9 +83,8 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
 def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> None:
     from umf_ros.bags.frames import read_transforms
     from umf_ros.core.errors import writing
-    from umf_ros.core.io import write_atomically
+    from umf_ros.core.io import check_absent, write_atomically
     from umf_ros.lab.evaluation.inspection import GUESS, calibration_of_dataset, write_calibration, write_settings
-    from umf_ros.lab.imported import check_absent
 
     settings, calibration = folder / "my_rover.yaml", folder / "my_calibration.yaml"
     check_absent(settings, calibration)
