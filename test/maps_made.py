@@ -41,7 +41,6 @@ class MadeSession:
     name: str
     first_m: int
     last_m: int
-    odometry: bool = True
     between: list[LoopClosure] = field(default_factory=list)
 
     @property
@@ -59,8 +58,7 @@ class MadeSession:
         noise = expmap(np.random.default_rng(seed).normal(size=(len(steps), 6)) * SIGMAS)
         for row, stamp in enumerate(range(self.first_m, self.last_m + 1)):
             pose = pose if row == 0 else pose @ steps[row - 1] @ noise[row - 1]
-            spread = np.diag([np.inf] * 6) if row == 0 else COVARIANCE
-            yield OdometrySample(self.stamp(stamp), pose, None if self.odometry else spread)
+            yield OdometrySample(self.stamp(stamp), pose)
 
 
 def relative_steps(poses: Array) -> Array:
@@ -83,9 +81,7 @@ def made_map(path: Path, sessions: list[MadeSession], settings: Settings | None 
         first, last = made.stamp(made.first_m), made.stamp(made.last_m)
         recording = {"path": f"{made.name}.mcap", "start_ns": first, "end_ns": last, "messages": {"a": number}}
         shift = folder.shift_for(first)
-        folder.add(
-            MapSession(made.name, recording, shift, first, last, 100 * number, len(metres), number, 1, made.odometry)
-        )
+        folder.add(MapSession(made.name, recording, shift, first, last, 100 * number, len(metres), number, 1))
         write_table(run / BETWEEN, CLOSURES, [closure_row(closure, 0.9) for closure in made.between])
     return folder
 

@@ -201,11 +201,12 @@ def test_a_replay_that_was_cut_off_ends_like_one_that_was_not(
     settings = settings.model_copy(update={"database": Database(path=str(tmp_path / "places.sqlite"))})
     for name in ("whole", "cut"):
         (tmp_path / name).mkdir()
-    cut = replay_of(tmp_path / "cut", settings)
+    detector = LoopDetector(settings, ThumbnailEmbedder())
+    cut = Replay(tmp_path / "cut", settings, detector)
     for count, _ in enumerate(cut.run(stream), 1):
         if count == frames_done:
             break
-    cut._detector.database.close()  # the locks go with the process, and nothing else is left of it
+    detector.database.close()  # the locks go with the process, and nothing else is left of it
     cut._recorder._file.close()
     resumed = Replay(tmp_path / "cut", settings, LoopDetector(settings, ThumbnailEmbedder()), resume=True)
     list(resumed.run(stream))

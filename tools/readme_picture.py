@@ -8,16 +8,22 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import cv2
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import hsv
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from umf_ros.bags.reader import open_bag
+from umf_ros.core.geometry import evenly
 from umf_ros.runs.reader import FinishedRun, read_run
-from umf_ros.runs.report import ODOMETRY, OPTIMISED, RIGHT, TRUTH
-from umf_ros.runs.scene import error_curves
+from umf_ros.runs.run_file import read_inliers
+from umf_ros.runs.scene import error_curves, read_pictures
 from umf_ros.runs.truth import positions_in_truth
+from umf_ros.sensors.decode import decode_picture
+
+TRUTH, ODOMETRY, OPTIMISED, RIGHT = "#222222", "#e07b00", "#1f6fb4", "#2ca02c"
+LINES = 60
 
 
 def draw(run: FinishedRun, out: Path) -> None:
@@ -39,10 +45,7 @@ def draw(run: FinishedRun, out: Path) -> None:
         above.plot([], [], color=RIGHT, label=f"{len(run.closures)} closures")
     above.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     above.legend(loc="best", fontsize=9)
-    pictures = sorted((run.folder / "matches").glob("*.png"))
-    if pictures:
-        match.imshow(cv2.cvtColor(cv2.imread(str(pictures[len(pictures) // 2])), cv2.COLOR_BGR2RGB))
-    match.set_axis_off()
+    draw_match(match, run)
     for (name, (way, off)), colour in zip(error_curves(run).items(), (ODOMETRY, OPTIMISED), strict=False):
         error.plot(way, off, color=colour, linewidth=1.8, label=name)
     error.set(xlabel="way [m]", ylabel="error [m]", ylim=(0, None))
@@ -50,6 +53,26 @@ def draw(run: FinishedRun, out: Path) -> None:
     error.legend(loc="upper left", fontsize=9)
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=100)
+
+
+def draw_match(axes: Axes, run: FinishedRun) -> None:
+    """Both images of a closure in the middle of the run, side by side and joined at the inliers."""
+    axes.set_axis_off()
+    inliers = read_inliers(run.folder / "inliers.csv")
+    keys = [one.endpoints for one in run.closures if one.endpoints in inliers]
+    if not keys:
+        return
+    key = keys[len(keys) // 2]
+    pictures, _ = read_pictures(run.folder, key, None)
+    images = [decode_picture(pictures[stamp].jpeg) for stamp in key]
+    if any(image is None for image in images):
+        return
+    axes.imshow(np.hstack(images), cmap="gray")
+    scale, lines = images[0].shape[1] / pictures[key[0]].width, inliers[key]
+    ends = scale * lines[evenly(len(lines), LINES)].reshape(-1, 2, 2) + [[0, 0], [images[0].shape[1], 0]]
+    axes.add_collection(
+        LineCollection(ends.tolist(), colors=[hsv(i / LINES) for i in range(len(ends))], linewidths=0.7)
+    )
 
 
 def main() -> None:

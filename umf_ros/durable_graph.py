@@ -67,13 +67,7 @@ def feed(graph: PoseGraph, inputs: Iterable[GraphInput], splitter: OdometrySessi
         if isinstance(item, AbsoluteMeasurement):
             graph.add_absolute(item)
             continue
-        if item.covariance is None:
-            splitter.take(item.stamp_ns, item.odom_T_body)
-        else:
-            unknown = bool(np.isinf(item.covariance).any())
-            if unknown and begun:
-                graph.begin_session()
-            graph.add_odometry(item.stamp_ns, item.odom_T_body, None if unknown else item.covariance)
+        splitter.take(item.stamp_ns, item.odom_T_body)
         begun = True
     return begun
 

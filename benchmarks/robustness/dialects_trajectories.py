@@ -1,112 +1,19 @@
-"""Trajectories of odometry and truth as other programs write them, read as files and used to judge a run."""
+"""Trajectories of a truth as other programs write them, used to judge a run."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from dialect_case import Case, Check, Outcome, says, simulated, umf
-from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.reader import open_bag
-from umf_ros.bags.trajectories import read_ground_truth, read_tum
-from umf_ros.core.errors import UmfError
-from umf_ros.core.geometry import Array, make_pose, to_quaternion
+from umf_ros.bags.trajectories import read_ground_truth
+from umf_ros.core.geometry import make_pose
 from umf_ros.core.trajectory import Trajectory, write_tum
-
-START_NS, COUNT = 1_625_644_800_000_000_000, 300
-
-
-def _pose(second: float) -> Array:
-    yaw = 0.2 * second
-    turn = Rotation.from_euler("zyx", [yaw, 0.05 * np.sin(yaw), 0.1])
-    return make_pose(turn.as_matrix(), [5 * np.sin(yaw), 5 - 5 * np.cos(yaw), 0.1 * second])
-
-
-TRUE = np.stack([_pose(0.2 * k) for k in range(COUNT)])
-STAMPS = START_NS + 200_000_000 * np.arange(COUNT)
-
-
-def lines(form: str = "{s} {p} {q}") -> list[str]:
-    """Lines of the poses: stamps s and t in seconds and in other units, position p, quaternion q, or w with w first."""
-    found = []
-    for k, (ns, pose, quaternion) in enumerate(zip(STAMPS.tolist(), TRUE, to_quaternion(TRUE), strict=True)):
-        words = {"s": f"{ns // 10**9}.{ns % 10**9:09d}", "ns": ns, "us": ns // 1000, "ms": ns // 10**6, "k": k}
-        words |= {"f": float(ns), "t": ns * 1e-9}
-        words |= {"p": _text(pose[:3, 3]), "q": _text(quaternion), "w": _text(np.roll(quaternion, 1))}
-        found.append(form.format(**words))
-    return found
-
-
-def _text(values: Array) -> str:
-    return " ".join(f"{value:.9f}" for value in values)
-
-
-def _euler() -> list[str]:
-    turns = Rotation.from_matrix(TRUE[:, :3, :3]).as_euler("xyz", degrees=True)
-    return [f"{line} {_text(turn)}" for line, turn in zip(lines("{s} {p}"), turns, strict=True)]
-
-
-def _replaced(old: str, new: str) -> list[str]:
-    return [line.replace(old, new) for line in lines()]
-
-
-PLAIN = lines()
-EUROC = (
-    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],v_RS_R_x [m s^-1]"
-)
-READ: dict[str, Sequence[str]] = {
-    "plain": PLAIN,
-    "nanoseconds": lines("{ns} {p} {q}"),
-    "nanoseconds_as_float": lines("{f:.6f} {p} {q}"),
-    "microseconds": lines("{us} {p} {q}"),
-    "milliseconds": lines("{ms} {p} {q}"),
-    "exponents": lines("{t:.18e} {p} {q}"),
-    "header": ["timestamp tx ty tz qx qy qz qw", *PLAIN],
-    "header_percent": ["% timestamp tx ty tz qx qy qz qw", *PLAIN],
-    "tabs": _replaced(" ", "\t"),
-    "commas": _replaced(" ", ","),
-    "semicolons": _replaced(" ", ";"),
-    "decimal_commas": _replaced(".", ","),
-    "euroc": [EUROC, *(line.replace(" ", ",") for line in lines("{ns} {p} {w} 0.5"))],
-    "index": ["num,t,x,y,z,qx,qy,qz,qw", *(line.replace(" ", ",") for line in lines("{k} {s} {p} {q}"))],
-    "trailing_columns": lines("{s} {p} {q} 0.1 0 0.1"),
-    "trailing_blanks": lines("{s} {p} {q}  "),
-    "empty_lines": ["", *PLAIN[:9], "", *PLAIN[9:], "", ""],
-    "duplicate": [*PLAIN[:9], *PLAIN[8:]],
-    "w_first": lines("{s} {p} {w}"),
-    "nan_line": [*PLAIN[:9], f"{(START_NS + 10**9 * 17 // 10) / 1e9:.3f} {'nan ' * 7}", *PLAIN[9:]],
-}
-REFUSED: dict[str, tuple[Sequence[str], str]] = {
-    "kitti": (["1 0 0 0 0 1 0 0 0 0 1 0"] * 9, "KITTI's poses have no stamps"),
-    "euler": (_euler(), "expected 8 numbers"),
-    "few_digits": (lines("{t:.6g} {p} {q}"), "is not later than the one before"),
-    "whole_seconds": (lines("{t:.0f}.000 {p} {q}"), "is not later than the one before"),
-    "unsorted": ([*PLAIN[100:], *PLAIN[:100]], "is not later than the one before"),
-    "not_unit": ([*PLAIN[:9], f"{PLAIN[9].rsplit(' ', 1)[0]} 2.0"], "no unit quaternion"),
-}
-
-
-def _write(text: Sequence[str], encoding: str, end: str, folder: Path) -> None:
-    (folder / "in.tum").write_text(end.join([*text, ""]), encoding, newline="")
-
-
-def _read(folder: Path) -> str:
-    try:
-        found = read_tum(folder / "in.tum")
-    except UmfError as error:
-        return str(error)
-    if len(found) != COUNT:
-        return f"{len(found)} poses"
-    off = np.abs(found.poses - TRUE).max(), np.abs(found.stamps_ns - STAMPS).max() * 1e-9
-    return "as written" if off[0] < 1e-6 and off[1] < 1e-6 else f"{off[0]:.2g} m and {off[1]:.2g} s off"
-
-
-def _reading(name: str, text: Sequence[str], said: str, encoding: str = "utf-8", end: str = "\n") -> Case:
-    return Case(f"10 {name}", partial(_write, text, encoding, end), _read, said, says(said))
 
 
 def _run_with(change: Callable[[Trajectory], Trajectory], folder: Path) -> None:
@@ -155,11 +62,6 @@ def _clock(name: str, seconds: float, change: Callable[[Trajectory], Trajectory]
 
 
 CASES = [
-    *(_reading(name, text, "as written") for name, text in READ.items()),
-    *(_reading(name, text, said) for name, (text, said) in REFUSED.items()),
-    _reading("byte_order_mark", PLAIN, "as written", "utf-8-sig"),
-    _reading("utf16", PLAIN, "as written", "utf-16"),
-    _reading("crlf", PLAIN, "as written", end="\r\n"),
     _judging("truth", lambda truth: truth, "0 false", _none_false),
     _judging("positions_only", _unturned, "0 false", _none_false),
     _judging("one_hertz", _every(25), "0 false", _none_false),

@@ -35,7 +35,7 @@ from umf_ros.core.config import load_preset, load_settings, topics_of
 from umf_ros.core.errors import BagError, ConfigError
 from umf_ros.core.resources import find, share_folders
 from umf_ros.sensors.calibration import calibration_of, load_calibration
-from umf_ros.sensors.decode import decode_cloud, decode_image, decode_odometry, stamp_ns
+from umf_ros.sensors.decode import decode_cloud, decode_image, decode_pose, stamp_ns
 
 ENTRIES = traverse(1.0)
 
@@ -179,7 +179,7 @@ def test_every_format_gives_the_same_messages_in_the_same_order(form: str, tmp_p
         elif topic == CLOUD:
             assert (decode_cloud(got).points == decode_cloud(put).points).all()
         elif topic == ODOMETRY:
-            assert np.allclose(decode_odometry(got).odom_T_body, decode_odometry(put).odom_T_body)
+            assert np.allclose(decode_pose(got.pose.pose), decode_pose(put.pose.pose))
         assert stamp_ns(got) == stamp_ns(put)
     assert {topic: info.count for topic, info in bag.topics.items()} == {
         topic: sum(entry[0] == topic for entry in ENTRIES) for topic in {entry[0] for entry in ENTRIES}

@@ -41,7 +41,6 @@ def test_both_are_in_one_frame_and_right(made: tuple[Path, Ended], mini_bag: Pat
     assert ended.status == 0, ended.text
     summary = json.loads((out / "summary.json").read_text())
     assert summary["joined"] == 2 and summary["closures_between"]["accepted"] >= 4
-    assert [one["odometry"] for one in summary["sessions"]] == [True, True]
     truth = read_ground_truth(open_bag(mini_bag))
     assert truth is not None
     for name in ("mini", "again"):

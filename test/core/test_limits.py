@@ -24,8 +24,7 @@ from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.core.io import Schema, SqliteFile, read_yaml
 from umf_ros.localizer import POSES, read_poses
 from umf_ros.places.store import unpack
-from umf_ros.runs.run_file import Picture, read_table
-from umf_ros.runs.scene import photograph
+from umf_ros.runs.run_file import read_table
 from umf_ros.sensors.decode import decode_picture
 
 CONTENT = b"some text, and the same again " * 1000
@@ -225,16 +224,6 @@ def test_pictures_that_unpack_to_more_are_refused_by_their_header(kind: str) -> 
 )
 def test_what_is_no_picture_is_none(content: bytes) -> None:
     assert decode_picture(content) is None
-
-
-def test_pictures_of_a_run_are_not_enlarged_beyond_the_limit() -> None:
-    fine = Picture(1, FORMATS["jpg"], 160, 120, np.empty((0, 3), np.int16))
-    image = photograph(fine)
-    assert image is not None and image.shape == (120, 160)
-    assert photograph(fine._replace(jpeg=b"")) is None
-    for picture in (fine._replace(width=60_000, height=60_000), fine._replace(jpeg=BOMBS["jpg"]())):
-        with little(5, 1), pytest.raises(UmfError, match=r"a picture of the run cannot be shown: .* too large"):
-            photograph(picture)
 
 
 def test_values_of_a_store_are_limited(tmp_path: Path) -> None:

@@ -130,10 +130,8 @@ def test_a_blank_input_has_the_shapes_of_any_other():
         blank_input(TINY),
         pack([np.ones(TINY.image_size, np.float32)], [prepare_scan(None, None, TINY)], TINY),
     )
-    for name in blank._fields:
-        assert getattr(blank, name).shape == getattr(full, name).shape
-        assert getattr(blank, name).dtype == getattr(full, name).dtype
-        assert not getattr(blank, name).any()
+    for empty, other in zip(blank, full, strict=True):
+        assert empty.shape == other.shape and empty.dtype == other.dtype and not empty.any()
 
 
 @pytest.mark.parametrize("shape", [(128, 192), (512, 688), (37, 53)])

@@ -22,8 +22,8 @@ DAY_NS = 86_400 * 10**9
 PLACES = (22, 34, 46)
 
 
-def two(odometry: bool = True) -> tuple[MadeSession, MadeSession]:
-    first, second = MadeSession("first", 0, 60), MadeSession("second", 10, 80, odometry)
+def two() -> tuple[MadeSession, MadeSession]:
+    first, second = MadeSession("first", 0, 60), MadeSession("second", 10, 80)
     second.between = [tie((0, DAY_NS), first, second, metre) for metre in PLACES]
     return first, second
 
@@ -50,13 +50,6 @@ def test_without_closures_only_one_of_them_is_in_the_map(tmp_path: Path) -> None
     # the longer one is the map
     assert [one.joined for one in joint.sessions] == [False, True]
     assert len(joint.sessions[0].stamps) == 0
-
-
-def test_closures_join_a_session_without_odometry(tmp_path: Path) -> None:
-    made = two(odometry=False)
-    joint = solve(made_map(tmp_path / "map", list(made)))
-    assert joint.sessions[1].joined and not joint.sessions[1].session.odometry
-    assert error_m(joint, list(made)) < 0.5
 
 
 @pytest.mark.parametrize("wrong", [(20,), (20, 23, 26, 29)])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import CALIBRATION, ODOMETRY, START_NS, drive, traverse, write_mcap
+from recordings import CALIBRATION, CLOUD, ODOMETRY, START_NS, drive, traverse, write_mcap
 from submaps_drives import drive as drive_lidar
 from submaps_drives import rough_ground
 
@@ -144,12 +144,19 @@ def test_odometry_comes_from_a_file_of_its_name(tmp_path: Path, opening: Opening
     with_file = Opening(opening.config, embedder="thumbnail", odometry=tmp_path / "odometry")
     replay_session(bag, with_file, tmp_path / "run")
     odometry = odometry_in(tmp_path / "run")
-    assert len(odometry) == len(path) and all(one.covariance is None for one in odometry)
-    replay_session(bag, opening, tmp_path / "blind")
-    blind = odometry_in(tmp_path / "blind")
-    # noise is found in no other noise: every keyframe begins a session
-    assert len(blind) > 3 and all(one.covariance is not None and np.isinf(one.covariance[0, 0]) for one in blind)
-    assert [one.number for one in stored_sessions(tmp_path / "blind" / "places.sqlite")] == list(range(len(blind)))
+    assert len(odometry) == len(path)
+
+
+@pytest.mark.parametrize(
+    ("left_out", "why"), [((ODOMETRY,), "vgicp"), ((ODOMETRY, CLOUD), "neither odometry nor scans")]
+)
+def test_a_recording_without_odometry_is_refused_before_it_is_replayed(
+    tmp_path: Path, opening: Opening, left_out: tuple[str, ...], why: str
+) -> None:
+    bag = write_mcap(tmp_path / "b.mcap", [entry for entry in traverse(3.0) if entry[0] not in left_out])
+    with pytest.raises(BagError, match=why):
+        replay_session(bag, opening, tmp_path / "blind")
+    assert odometry_in(tmp_path / "blind") == []
 
 
 def test_a_narrow_lidar_joins_two_sessions_driven_in_opposite_directions(tmp_path: Path) -> None:
@@ -163,7 +170,7 @@ def test_a_narrow_lidar_joins_two_sessions_driven_in_opposite_directions(tmp_pat
         with closing(RunFile(folder)) as file:
             for one in keyframes:
                 assert one.odom_T_body is not None
-                file.append_odometry(OdometrySample(one.stamp_ns, one.odom_T_body, None))
+                file.append_odometry(OdometrySample(one.stamp_ns, one.odom_T_body))
         add_places(target, name, keyframes, ("none", 2), {"start_ns": keyframes[0].stamp_ns})
     out, back = target.sessions
     true = {one.stamp_ns: pose for one, pose in zip(outing.keyframes, outing.truth, strict=True)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from contextlib import closing
 from pathlib import Path
 
@@ -18,7 +19,6 @@ from umf_ros.runs.run_file import RunFile
 from umf_ros.sensors.decode import OdometrySample
 
 SECOND_NS = 10**9
-UNKNOWN = np.diag([np.inf] * 6)
 
 
 def at(x: float) -> np.ndarray:
@@ -29,12 +29,6 @@ def messages(*positions: float) -> list[OdometrySample]:
     return [OdometrySample(row * SECOND_NS, at(x)) for row, x in enumerate(positions)]
 
 
-TRACKED = [
-    OdometrySample(second * SECOND_NS, at(x), covariance)
-    for second, x, covariance in ((0, 0, UNKNOWN), (1, 1, 0.01 * np.eye(6)), (5, 0, UNKNOWN), (6, 1, 0.04 * np.eye(6)))
-]
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> MapFolder:
     folder = MapFolder.open_or_create(tmp_path / "map", Settings())
@@ -42,8 +36,8 @@ def folder(tmp_path: Path) -> MapFolder:
     return folder
 
 
-@pytest.mark.parametrize("put", [messages(0, 1, 2, 3), TRACKED], ids=["messages", "tracked"])
-def test_odometry_is_read_back_as_it_was(folder: MapFolder, put: list[OdometrySample]) -> None:
+def test_odometry_is_read_back_as_it_was(folder: MapFolder) -> None:
+    put = messages(0, 1, 2, 3)
     with closing(RunFile(folder.folder_of("a"))) as file:
         for one in put:
             file.append_odometry(one)
@@ -51,9 +45,16 @@ def test_odometry_is_read_back_as_it_was(folder: MapFolder, put: list[OdometrySa
     assert [one.stamp_ns for one in got] == [one.stamp_ns for one in put]
     for ours, theirs in zip(got, put, strict=True):
         np.testing.assert_array_equal(ours.odom_T_body, theirs.odom_T_body)
-        assert (ours.covariance is None) == (theirs.covariance is None)
-        if ours.covariance is not None and theirs.covariance is not None:
-            np.testing.assert_array_equal(ours.covariance, theirs.covariance)
+
+
+def test_estimates_of_an_earlier_release_are_refused(folder: MapFolder) -> None:
+    run = folder.folder_of("a")
+    with closing(RunFile(run)) as file:
+        file.append_odometry(messages(0)[0])
+    with closing(sqlite3.connect(run / "run.sqlite")) as connection, connection:
+        connection.execute("UPDATE odometry SET covariance = zeroblob(288)")
+    with pytest.raises(UmfError, match="only estimates between keyframes: map it again"):
+        folder.inputs_of("a")
 
 
 def test_a_graph_gets_it_on_another_clock_and_in_its_sessions() -> None:
@@ -61,12 +62,6 @@ def test_a_graph_gets_it_on_another_clock_and_in_its_sessions() -> None:
     later = (one._replace(stamp_ns=one.stamp_ns + 70 * SECOND_NS) for one in messages(0, 1, 2, 500, 501, 502, 503))
     assert feed(graph, later)  # it jumps: the rover was carried
     assert graph.session_spans() == [(70 * SECOND_NS, 72 * SECOND_NS), (73 * SECOND_NS, 76 * SECOND_NS)]
-
-
-def test_tracked_poses_keep_their_sessions() -> None:
-    graph = PoseGraph(PoseGraphSettings())
-    feed(graph, TRACKED)
-    assert graph.session_spans() == [(0, SECOND_NS), (5 * SECOND_NS, 6 * SECOND_NS)]
 
 
 def test_a_session_without_its_run_is_refused(folder: MapFolder) -> None:

@@ -57,7 +57,7 @@ class Rig(Node):
         self.create_subscription(DiagnosticArray, "/diagnostics", self._listen, 10)
         self.scans: list[PointCloud2] = []
         self.create_subscription(PointCloud2, "/loop_closure_node/keyframe_scans", self.scans.append, 50)
-        self._rng = np.random.default_rng(0)
+        self.rng = np.random.default_rng(0)
 
     def _listen(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -67,7 +67,7 @@ class Rig(Node):
                 self.level = status.level
 
     def image(self, stamp_ns: int, **changes: object) -> Image:
-        pixels = self._rng.integers(0, 255, 688 * 512, np.uint8)
+        pixels = self.rng.integers(0, 255, 688 * 512, np.uint8)
         message = Image(height=512, width=688, step=688, encoding="mono8", data=array("B", pixels.tobytes()))
         message.header.stamp = to_time(stamp_ns)
         for name, value in changes.items():
@@ -76,7 +76,7 @@ class Rig(Node):
 
     def cloud(self, stamp_ns: int) -> PointCloud2:
         points = np.zeros(500, POINT)
-        points["x"], points["y"] = self._rng.uniform(-5, 5, 500), self._rng.uniform(3, 20, 500)
+        points["x"], points["y"] = self.rng.uniform(-5, 5, 500), self.rng.uniform(3, 20, 500)
         points["intensity"] = 100
         fields = [
             PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32 if i < 3 else PointField.UINT32, count=1)
@@ -158,7 +158,7 @@ def test_what_waits_at_the_end_is_told_and_can_be_played_again(rig: Rig, tmp_pat
         assert rig.until(lambda: rig.images.get_subscription_count() and rig.clouds.get_subscription_count())
         rig.until(lambda: False, timeout_s=2.0)  # the node has discovered the rig, too
         rig.values.clear()
-        rig._rng = np.random.default_rng(0)  # the same recording
+        rig.rng = np.random.default_rng(0)  # the same recording
         for stamp_ns in stamps:
             rig.publish_pair(stamp_ns)
             rig.until(lambda: False, timeout_s=0.05)

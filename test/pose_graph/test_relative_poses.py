@@ -4,28 +4,28 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
-from graph_worlds import drive
+from graph_worlds import SETTINGS, chain_of, placed
 
+from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.geometry import invert
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
-from umf_ros.pose_graph.backend import PoseGraph
-from umf_ros.pose_graph.odometry import PathPoints
+from umf_ros.pose_graph.closures import as_closures
+from umf_ros.pose_graph.consistency import NoiseScale
+from umf_ros.pose_graph.sessions import RelativeCovariances, Sessions
 from umf_ros.pose_graph.solver import between
-
-
-def stop(graph: PoseGraph, *poses: int) -> PathPoints:
-    """Where poses of the first session are."""
-    return graph._sessions.chains[0].at(np.array(poses, np.int64) * PERIOD_NS)
 
 
 def test_the_bound_of_a_relative_covariance_is_never_below_the_true_one() -> None:
     world = rover_loops(300, 12)
-    solved = drive(world)
-    relative_poses = solved._rejection._map
-    assert relative_poses is not None
+    chain = chain_of(world)
+    sessions = Sessions(SETTINGS, AbsoluteReference(SETTINGS), [chain])
+    closures = np.concatenate([as_closures(one, row, [chain]) for row, one in enumerate(placed(world))])
+    sessions.solve(closures, NoiseScale())
+    relative_poses = RelativeCovariances(sessions, 1.0)
+    points = chain.at(np.arange(300) * PERIOD_NS)
     full, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     steps = invert(world.odometry[:-1]) @ world.odometry[1:]
-    for k, pose in enumerate(solved.trajectory()[1]):
+    for k, pose in enumerate(sessions.at(points)):
         values.insert(k, gtsam.Pose3(pose))
         if k:
             full.add(between(k - 1, k, steps[k - 1], world.step_covariances[k]))
@@ -35,5 +35,5 @@ def test_the_bound_of_a_relative_covariance_is_never_below_the_true_one() -> Non
         anchored = gtsam.NonlinearFactorGraph(full)
         anchored.add(gtsam.PriorFactorPose3(i, values.atPose3(i), gtsam.noiseModel.Isotropic.Sigma(6, 1e-9)))
         exact = gtsam.Marginals(anchored, values).marginalCovariance(j)
-        bound = relative_poses.bounds(stop(solved, i), stop(solved, j))[0][0]
+        bound = relative_poses.bounds(points[[i]], points[[j]])[0][0]
         assert np.linalg.eigvalsh(bound - exact).min() > -0.02 * np.linalg.eigvalsh(exact).max()

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from finished_runs import accepted, at, candidate, closure, examined, trajectory
+from finished_runs import accepted, candidate, closure, examined, trajectory
 from rich.console import Console
-from support.judged import judge_closure
 
 from umf_ros.bags.inputs import Advice
 from umf_ros.pose_graph.closures import ClosureReason, State
 from umf_ros.runs.findings import conclude, look_first
-from umf_ros.runs.report import closure_rows, describe, final_verdicts, print_summary, write_page
+from umf_ros.runs.report import closure_rows, final_verdicts, print_summary, write_page
 from umf_ros.runs.scene import build_scene, pairs_of
 from umf_ros.runs.truth import JudgedRun
 from umf_ros.verification import RejectReason
@@ -145,10 +144,3 @@ def test_without_a_keyframe_there_is_no_latency_and_a_page_all_the_same(tmp_path
     empty = {stage: {"p50": None} for stage in ("embed", "query", "verify", "total")}
     page = written(examined(tmp_path, keyframe_rows=[], latency_ms=empty, keyframes=0))
     assert "latency" not in Read(page).text and scene_in(page)["pairs"] == []
-
-
-def test_a_match_is_described_in_a_line() -> None:
-    one = closure(50, 10, error_m=0.5)
-    assert describe(one, 31, None) == "0.50 m, 0.0 deg apart   p 0.970   31 image inliers"
-    wrong = judge_closure(closure(50, 10, error_m=0.66), at(50), at(10))
-    assert describe(one, 0, wrong).endswith("0 image inliers   FALSE, 0.66 m off")

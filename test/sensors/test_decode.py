@@ -14,7 +14,7 @@ from umf_ros.sensors.decode import (
     decode_camera_info,
     decode_cloud,
     decode_image,
-    decode_odometry,
+    decode_pose,
     stamp_ns,
 )
 
@@ -239,12 +239,6 @@ def test_unknown_data_type_is_refused() -> None:
     assert kind_of(decode_cloud, message) == "datatype"
 
 
-def test_odometry_is_a_stamped_pose() -> None:
-    sample = decode_odometry(odometry(START_NS, drive(1.3)))
-    assert sample.stamp_ns == START_NS
-    assert np.allclose(sample.odom_T_body, drive(1.3))
-
-
 @pytest.mark.parametrize(
     ("part", "field", "value"),
     [("position", "x", np.nan), ("position", "z", np.inf), ("orientation", "w", 0.5), ("orientation", "y", np.nan)],
@@ -252,7 +246,7 @@ def test_odometry_is_a_stamped_pose() -> None:
 def test_pose_that_is_none_is_refused(part: str, field: str, value: float) -> None:
     message = odometry(START_NS, np.eye(4))
     setattr(getattr(message.pose.pose, part), field, value)
-    assert kind_of(decode_odometry, message) == "pose"
+    assert kind_of(decode_pose, message.pose.pose) == "pose"
 
 
 def test_camera_info_gives_the_pair() -> None:
@@ -400,4 +394,4 @@ def test_numbers_that_no_sensor_sends_raise_no_warning(kind: str, value: float) 
 def test_an_orientation_that_overflows_is_refused_without_a_warning() -> None:
     message = odometry(START_NS, drive(0.0))
     message.pose.pose.orientation.w = 1e300
-    assert kind_of(decode_odometry, message) == "pose"
+    assert kind_of(decode_pose, message.pose.pose) == "pose"

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
-from umf_ros.bags.reader import Bag, RawMessage, message_types, open_bag
+from umf_ros.bags.reader import Bag, RawMessage, message_types, open_bag, open_files
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings, load_preset, load_settings, topics_of
 from umf_ros.core.frames import Frame
@@ -314,7 +314,7 @@ class ChangedBag(Bag):
     """A recording whose messages are changed as they are read."""
 
     def __init__(self, bag: Bag, change: Change) -> None:
-        super().__init__(bag.path, bag._files)
+        super().__init__(bag.path, open_files(bag.path))
         self._change = change
 
     def raw_messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:

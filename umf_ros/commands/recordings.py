@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.reader import Bag
     from umf_ros.core.config import Settings
     from umf_ros.core.trajectory import Trajectory
@@ -31,9 +30,6 @@ ConfigPath = Annotated[Path | None, typer.Option("--config", help="Parameter fil
 DatasetName = Annotated[str, typer.Option("--dataset", help=f"{either(['auto', *dataset_names()])}.")]
 EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"Embedding method: {choices()}.")]
 WeightsPath = Annotated[Path | None, typer.Option("--weights", help="Weights file; default: umf_scene.")]
-OdometryPath = Annotated[
-    Path | None, typer.Option("--odometry", help="Odometry as a TUM file, where the recording has none.")
-]
 OdometryChoice = Annotated[
     str | None,
     typer.Option(
@@ -171,14 +167,3 @@ class ChosenOdometry:
         path = (folder / MADE_ODOMETRY).resolve()
         write_tum(path, made)
         return {"path": str(path), "frame": "body", "engine": self.engine}
-
-
-def open_frames(
-    recording: Bag, settings: Settings, warn: Callable[[str], None], odometry: Path | None, odometry_frame: str
-) -> FrameReader:
-    """Read the frames of a recording, with the odometry of a file if one is given; `warn` takes the faults."""
-    from umf_ros.bags.frames import FrameReader
-    from umf_ros.bags.trajectories import read_odometry
-
-    path = read_odometry(odometry, odometry_frame, settings) if odometry else None
-    return FrameReader(recording, settings, path, warn=warn)

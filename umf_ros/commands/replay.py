@@ -139,7 +139,7 @@ def command(
         if settings.localizing:
             status = _report_localization(console, folder, replay.counts, newest)
         else:
-            from umf_ros.runs.report import finish_run  # Matplotlib delays a start
+            from umf_ros.runs.report import finish_run
 
             truth = truth or (read_ground_truth(recording) if interrupted() else reader.ground_truth)
             run = read_run(folder, recording, truth)

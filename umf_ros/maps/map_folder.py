@@ -42,7 +42,6 @@ class MapSession:
         first_ns, last_ns: the time it covers, own clock.
         first_place, places: its rows in the place database.
         first_number, numbers: its sessions in the place database: one, or more where its odometry restarted.
-        odometry: whether the recording has odometry; otherwise its keyframes were tracked.
     """
 
     name: str
@@ -54,7 +53,6 @@ class MapSession:
     places: int
     first_number: int
     numbers: int
-    odometry: bool
 
     def covers(self, map_ns: int) -> bool:
         """Return whether the recording covers a stamp of the map's clock."""

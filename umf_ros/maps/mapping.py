@@ -15,7 +15,6 @@ A recording or map that cannot be read raises an `UmfError`, a folder that canno
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
@@ -24,16 +23,14 @@ from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
-import numpy as np
-
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
 from umf_ros.bags.trajectories import read_odometry
-from umf_ros.core.config import Database, Settings, Verification
+from umf_ros.core.config import Database, Settings, topics_of
 from umf_ros.core.errors import BagError, UmfError, writing
-from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
+from umf_ros.core.frames import Keyframe
 from umf_ros.core.io import lock_file, write_table
 from umf_ros.core.limits import read_json
 from umf_ros.core.resources import MADE_ODOMETRY, ODOMETRY_ENGINES
@@ -53,11 +50,10 @@ from umf_ros.submaps import SubmapFinder
 from umf_ros.submaps.history import SubmapHistory
 from umf_ros.verification import Hypothesis, Verifier
 
-_log = logging.getLogger(__name__)
 OnFrame = Callable[[float, Detection], None]
 """Called for every frame with the processed share of the recording, 0 to 1, and the detection."""
-_UNKNOWN = np.diag([np.inf] * 6)
 RECORDINGS = (".mcap", ".db3", ".bag")
+REMEDY = "which a map needs: give --odometry FILE.tum"
 FEWEST = 2
 """Places of a session: one alone has no odometry to anything."""
 
@@ -134,68 +130,22 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
         on_frame(reader.progress, detection)
     has_odometry = replay.finish(count_drops(reader.counters))
     remember_recording(folder, bag)
-    if not has_odometry:
-        _track(folder, settings)
     replay.raise_if_frames_failed()
+    if not has_odometry:
+        raise BagError(f"{recording} has no usable odometry, {REMEDY}")
 
 
 def _odometry(bag: Bag, opening: Opening, settings: Settings, folder: Path) -> Trajectory | None:
     """Return the odometry of a file, or of the scans where the recording has none, which is kept in the run folder."""
     given, made = opening.odometry_of(bag.path, settings), folder / MADE_ODOMETRY
-    if given is not None or not can_track(bag, settings):
+    topic = bag.topics.get(topics_of(settings).odometry)
+    if given is not None or (topic is not None and topic.count):
         return given
-    try:
-        found = odometry_of_scans(bag, settings, ODOMETRY_ENGINES[0], made)
-    except BagError as error:
-        _log.warning("no odometry: %s", error)
-        return None
+    if not can_track(bag, settings):
+        raise BagError(f"{bag.path} has neither odometry nor scans to make it from, {REMEDY}")
+    found = odometry_of_scans(bag, settings, ODOMETRY_ENGINES[0], made)
     write_tum(made, found)
     return found
-
-
-def _track(folder: Path, settings: Settings) -> None:
-    """Track a recording without odometry, and store its keyframes with the tracked poses as odometry."""
-    old, new = folder / PLACES, folder / f"tracked_{PLACES}"
-    with closing(open_places(old)) as places:
-        odometry, tracked = track((places[row] for row in range(len(places))), settings.verification)
-    with closing(PlaceDatabase(Database(path=str(new)), *stored_identity(old))) as places:
-        for keyframe in tracked:
-            places.add(keyframe)
-    with writing(old):
-        new.replace(old)
-    with closing(RunFile(folder)) as file:
-        for one in odometry:
-            file.append_odometry(one)
-
-
-def track(keyframes: Iterable[Keyframe], settings: Verification) -> tuple[list[OdometrySample], list[Keyframe]]:
-    """Track a recording without odometry by closures between consecutive keyframes.
-
-    Two consecutive keyframes without a closure begin a new session, which other closures have to connect. Returns the
-    poses, and the keyframes with `odom_T_body`, `path_length_m` and `session`, which counts from 0.
-    """
-    odometry: list[OdometrySample] = []
-    tracked: list[Keyframe] = []
-    pose, path_m, session = np.eye(4), 0.0, 0
-    before: Keyframe | None = None
-    for keyframe in keyframes:
-        closure = None if before is None else _closure(before, keyframe, settings)
-        if closure is None:
-            session += before is not None
-            pose, path_m, covariance = np.eye(4), 0.0, _UNKNOWN
-        else:
-            step, covariance = closure.match_T_query, closure.covariance
-            pose, path_m = pose @ step, path_m + float(np.linalg.norm(step[:3, 3]))
-        odometry.append(OdometrySample(keyframe.stamp_ns, pose, covariance))
-        tracked.append(replace(keyframe, odom_T_body=pose, path_length_m=path_m, session=session))
-        before = keyframe
-    return odometry, tracked
-
-
-def _closure(before: Keyframe, keyframe: Keyframe, settings: Verification) -> LoopClosure | None:
-    """Verify a keyframe against the one before it, alone: earlier closures would need odometry between them."""
-    similarity = float(before.embedding.descriptor @ keyframe.embedding.descriptor)
-    return Verifier(settings).verify(keyframe, [(Candidate(0, before.stamp_ns, similarity), before)])[0].closure
 
 
 def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
@@ -250,7 +200,6 @@ def add_places(
             places=len(known),
             first_number=first_number,
             numbers=places.next_session - first_number,
-            odometry=not odometry or odometry[0].covariance is None,
         )
     target.add(session)
     return session

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.colors import to_hex
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -27,7 +27,7 @@ from umf_ros.maps.map_folder import MapFolder
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import stored_identity
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, State, verdict_rows
-from umf_ros.runs.report import plot_trajectories, render
+from umf_ros.runs.report import render
 from umf_ros.runs.scene import HeightMap, data_address
 from umf_ros.terrain.grid import write_terrain
 from umf_ros.terrain.voxels import REACH_M, PlacedScan, VoxelMap
@@ -113,7 +113,6 @@ def _about(joint: JointMap, one: JointSession, ties: int) -> dict[str, Any]:
     return {
         "name": session.name,
         "recording": session.recording["path"],
-        "odometry": session.odometry,
         "places": session.places,
         "places_in_map": len(one.stamps),
         "joined": one.joined,
@@ -138,15 +137,25 @@ def _write_poses(path: Path, joint: JointMap) -> None:
 
 def _draw(path: Path, joint: JointMap) -> None:
     """Plot all joined sessions from above, and the accepted closures between them."""
-    palette = colormaps["tab10"]
-    shown = [one for one in joint.sessions if one.joined]
-    curves = [(one.session.name, to_hex(palette(i % 10)), one.poses[:, :3, 3]) for i, one in enumerate(shown)]
+    figure = Figure(figsize=(9, 7), layout="constrained")
+    axes = figure.subplots()
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(alpha=0.3)
+    for one in joint.sessions:
+        if one.joined:
+            axes.plot(*one.poses[:, :2, 3].T, linewidth=1.6, label=one.session.name)
     closures = joint.accepted_between()
     stamps = np.array([(c.match_stamp_ns, c.query_stamp_ns) for c in closures], np.int64).reshape(-1)
     poses, known = joint.graph.poses_at(stamps)
-    lines = poses[:, :3, 3].reshape(-1, 2, 3)[known.reshape(-1, 2).all(axis=1)]
+    lines = poses[:, :2, 3].reshape(-1, 2, 2)[known.reshape(-1, 2).all(axis=1)]
+    if len(lines):
+        name = f"closures found: {len(lines)}"
+        axes.add_collection(LineCollection(lines.tolist(), colors="#64748b", linewidths=1.0, alpha=0.8, label=name))
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="best", fontsize=9)
     with writing(path):
-        plot_trajectories(path, curves, lines, [None] * len(lines))
+        figure.savefig(path, dpi=120)
 
 
 def _write_report(folder: Path, summary: dict[str, Any]) -> None:

@@ -116,14 +116,14 @@ class RunFile:
             _set_aside(folder)
         self._file = SqliteFile(self._path, SCHEMA, read_only=read_only)
         self._received = 0
-        self._odometry: deque[tuple[int, int, bytes, bytes | None]] = deque()
+        self._odometry: deque[tuple[int, int, bytes]] = deque()
         self._absolute: list[tuple[str, int, int, bytes]] = []
 
     @contextmanager
     def writing(self) -> Iterator[None]:
         """Open a transaction, which also writes the odometry received since the last one."""
         with self._file.writing() as connection:
-            connection.executemany("INSERT OR IGNORE INTO odometry VALUES (?, ?, ?, ?)", self._odometry)
+            connection.executemany("INSERT OR IGNORE INTO odometry VALUES (?, ?, ?, NULL)", self._odometry)
             connection.executemany("INSERT OR IGNORE INTO absolute VALUES (?, ?, ?, ?)", self._absolute)
             yield
         self._odometry.clear()
@@ -148,10 +148,8 @@ class RunFile:
 
     def append_odometry(self, odometry: OdometrySample) -> None:
         """Add the next odometry of the recording with the next transaction; a known one stays."""
-        stamp_ns, pose, covariance = odometry
-        spread = None if covariance is None else np.ascontiguousarray(covariance, np.float64).tobytes()
-        numbers = np.ascontiguousarray(pose[:3], np.float64).tobytes()
-        self._odometry.append((self._received, stamp_ns, numbers, spread))
+        numbers = np.ascontiguousarray(odometry.odom_T_body[:3], np.float64).tobytes()
+        self._odometry.append((self._received, odometry.stamp_ns, numbers))
         self._received += 1
 
     def append_absolute(self, measurement: AbsoluteMeasurement) -> None:
@@ -179,13 +177,17 @@ class RunFile:
             return [parse_closure(dict(zip(CLOSURES, row, strict=True))) for row in self.rows("closures")]
 
     def odometry(self) -> list[OdometrySample]:
-        """Return the odometry of the run in the order of arrival."""
+        """Return the odometry of the run in the order of arrival.
+
+        An `UmfError` refuses poses that an earlier release estimated from keyframe to keyframe.
+        """
         found = []
         with self._file.reading() as connection:
-            for _, stamp_ns, data, spread in connection.execute("SELECT * FROM odometry ORDER BY number"):
+            for _, stamp_ns, data, estimated in connection.execute("SELECT * FROM odometry ORDER BY number"):
+                if estimated is not None:
+                    raise UmfError(f"{self._path} has no odometry, only estimates between keyframes: map it again")
                 pose = np.vstack([np.frombuffer(data, np.float64).reshape(3, 4), (0, 0, 0, 1)])
-                covariance = None if spread is None else np.frombuffer(spread, np.float64).reshape(6, 6)
-                found.append(OdometrySample(int(stamp_ns), pose, covariance))
+                found.append(OdometrySample(int(stamp_ns), pose))
         return found
 
     def graph_inputs(self) -> Iterator[GraphInput]:
@@ -253,7 +255,7 @@ def read_descriptors(folder: Path) -> dict[int, Points]:
 def read_odometry_of(folder: Path) -> Trajectory | None:
     """Return the recorded odometry messages of a run with increasing stamps; None without any."""
     with closing(RunFile(folder, read_only=True)) as file:
-        return Trajectory.rising(one[:2] for one in file.odometry() if one.covariance is None)
+        return Trajectory.rising(file.odometry())
 
 
 def closure_row(closure: LoopClosure, similarity: float) -> list[Any]:

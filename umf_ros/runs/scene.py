@@ -12,10 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from umf_ros.core.errors import UmfError, reading
-from umf_ros.core.frames import Image, Points
+from umf_ros.core.frames import Points
 from umf_ros.core.geometry import Array, evenly, relative, rotation_angle, transform
-from umf_ros.core.limits import check_size
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, contributions, explain, missing, most_probable
@@ -23,7 +21,6 @@ from umf_ros.runs.findings import explain_missed
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import SCAN_UNIT_M, Endpoints, Picture, RunFile
 from umf_ros.runs.truth import JudgedRun, pose_in_truth, positions_in_truth
-from umf_ros.sensors.decode import decode_picture
 from umf_ros.verification.hypothesis import Hypothesis
 
 ORDER = ("false", "missed", "rejected", "pending", "tested", "accepted")
@@ -220,20 +217,6 @@ def read_pictures(
                 if known[0]:
                     heights.add(transform(poses[0], near))
     return pictures, heights
-
-
-def photograph(picture: Picture | None) -> Image | None:
-    """Return the left image (H, W) of a keyframe in its size, without the detail that was reduced; None without one.
-
-    Raises:
-        UmfError: the picture, or the size that it had, is too large.
-    """
-    with reading("a picture of the run", UmfError, "cannot be shown"):
-        reduced: Any = None if picture is None else decode_picture(picture.jpeg)
-        if picture is None or reduced is None:
-            return None
-        check_size(picture.width * picture.height, "it")
-        return cv2.resize(reduced, (picture.width, picture.height), interpolation=cv2.INTER_CUBIC)
 
 
 def data_address(kind: str, content: bytes) -> str:

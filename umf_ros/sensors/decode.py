@@ -79,18 +79,10 @@ class Cloud:
 
 
 class OdometrySample(NamedTuple):
-    """An odometry message, or the tracked pose of a keyframe of a recording without odometry.
-
-    Attributes:
-        stamp_ns: of the pose.
-        odom_T_body: (4, 4).
-        covariance: None for a message; (6, 6) of the motion since the previous tracked pose in ROS order, axes of the
-            previous body, infinite where the motion is unknown and a session begins.
-    """
+    """An odometry message: its stamp, and the pose (4, 4)."""
 
     stamp_ns: int
     odom_T_body: Array
-    covariance: Array | None = None
 
 
 def stamp_ns(message: Any) -> int:
@@ -242,11 +234,6 @@ def _record_type(fields: list[Any], point_step: int, order: str) -> np.dtype[Any
             raise MessageError("step", f"cloud field {field.name} lies outside the point step of {point_step} bytes")
     names, offsets = [field.name for field in fields], [field.offset for field in fields]
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": point_step})
-
-
-def decode_odometry(message: Any) -> OdometrySample:
-    """Return the pose of a nav_msgs/Odometry; raises as `decode_pose`."""
-    return OdometrySample(stamp_ns(message), decode_pose(message.pose.pose))
 
 
 def decode_pose(pose: Any) -> Array:

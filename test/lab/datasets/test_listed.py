@@ -114,5 +114,5 @@ def test_the_example_of_the_documentation_is_a_list_of_every_kind(tmp_path: Path
     example = re.search(r"```yaml\n(.*?)```", DOCS.read_text(), re.DOTALL)
     assert example
     (tmp_path / "example.yaml").write_text(example.group(1))
-    kinds = {type(entry) for entry in listed._entries(tmp_path / "example.yaml")}
+    kinds = {type(entry) for entry in listed.entries_of(tmp_path / "example.yaml")}
     assert kinds == set(listed.KINDS.values())

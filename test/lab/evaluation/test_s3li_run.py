@@ -23,7 +23,6 @@ from umf_ros.lab.datasets.s3li_folder import S3liFolder, S3liSequence
 from umf_ros.lab.datasets.simulated import poses_of
 from umf_ros.lab.evaluation.s3li_run import (
     S3liRun,
-    clock_lag_s,
     in_own_process,
     latex,
     pooled,
@@ -35,6 +34,7 @@ from umf_ros.lab.evaluation.s3li_run import (
     wilson,
 )
 from umf_ros.lab.simulation.twin_files import overlapping_pairs, view_overlap
+from umf_ros.runs.truth import clock_offset
 
 SECOND = 10**9
 LIKE = (0, 1, 2, 3, 4, 0, 3, 2, 3, 4)
@@ -121,7 +121,7 @@ def positions(stamps: np.ndarray, poses: np.ndarray, turn_deg: float = 0.0) -> T
 def test_a_clock_of_the_satellites_is_told_by_the_way(late_s: int) -> None:
     stamps, poses = drive(160)
     truth = positions(stamps + late_s * SECOND, poses, turn_deg=70)
-    assert clock_lag_s(Trajectory(stamps, poses), truth) == pytest.approx(-late_s, abs=0.51)
+    assert clock_offset(Trajectory(stamps, poses), truth) == pytest.approx(late_s, abs=0.51)
 
 
 def test_positions_that_are_in_utc_are_noticed(tmp_path: Path) -> None:

@@ -13,13 +13,11 @@ from umf_ros.commands.recordings import (
     ConfigPath,
     DatasetName,
     OdometryFrame,
-    OdometryPath,
     RunsFolder,
     TruthPath,
     WeightsPath,
     check_files,
     check_odometry_options,
-    open_frames,
     open_recording,
     refuse_unused,
 )
@@ -69,7 +67,8 @@ class RecordingOptions:
         """
         frame_of_odometry = check_odometry_options(self.odometry, self.odometry_frame)
 
-        from umf_ros.bags.trajectories import read_ground_truth
+        from umf_ros.bags.frames import FrameReader
+        from umf_ros.bags.trajectories import read_ground_truth, read_odometry
         from umf_ros.commands.console import WARNING
 
         recording, settings = open_recording(self.bag, self.config, self.dataset, self.embedder, weights)
@@ -80,7 +79,8 @@ class RecordingOptions:
         def warn(text: str) -> None:
             console.print(text, **WARNING)
 
-        frames = open_frames(recording, settings, warn, self.odometry, frame_of_odometry)
+        path = read_odometry(self.odometry, frame_of_odometry, settings) if self.odometry else None
+        frames = FrameReader(recording, settings, path, warn=warn)
         return OpenRecording(frames, settings, truth, recording.duration_s)
 
 
@@ -250,7 +250,7 @@ def command(
     config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording or place sets.")] = None,
     dataset: DatasetName = "auto",
     embedder: Annotated[str | None, Optional(help=f"How places are embedded: {choices()}.")] = None,
-    odometry: OdometryPath = None,
+    odometry: Annotated[Path | None, typer.Option(help="Odometry as a TUM file, where the recording has none.")] = None,
     odometry_frame: OdometryFrame = "",
     ground_truth: TruthPath = None,
     rule: Annotated[str, Optional(help="Definition of the same place in listed sequences: s3li or robotcar.")] = "s3li",

@@ -135,7 +135,7 @@ class SequenceList:
     """
 
     def __init__(self, path: Path) -> None:
-        self.worlds = [sequence for entry in _entries(path) for sequence in entry.read(path.parent)]
+        self.worlds = [sequence for entry in entries_of(path) for sequence in entry.read(path.parent)]
 
     def refresh(self) -> list[SampleSequence]:
         """The sequences; recordings do not become more."""
@@ -152,7 +152,8 @@ def open_source(path: Path) -> TrainingData:
     return SequenceList(path) if path.suffix in (".yaml", ".yml") else WorldFolder(path)
 
 
-def _entries(path: Path) -> list[ListEntry]:
+def entries_of(path: Path) -> list[ListEntry]:
+    """Return the entries of a list of data sets; raise a `ConfigError` if it is none."""
     content = read_yaml(path)
     if not isinstance(content, list) or not content:
         raise ConfigError(f"{path}: expected a list of sequences")

@@ -21,7 +21,7 @@ from umf_ros.core.geometry import Array, make_pose, to_quaternion
 from umf_ros.core.trajectory import Trajectory, bracket
 from umf_ros.runs.findings import gap_remedy
 from umf_ros.sensors.calibration import TO_BE_MEASURED, load_calibration
-from umf_ros.sensors.decode import OdometrySample, decode_camera_info, decode_cloud, decode_image, decode_odometry
+from umf_ros.sensors.decode import OdometrySample, decode_camera_info, decode_cloud, decode_image, decode_pose, stamp_ns
 from umf_ros.sensors.sensor_check import SensorCheck, SensorReport
 from umf_ros.sensors.tf import TOPIC, StaticTransforms
 from umf_ros.sensors.topic_finder import find_topics
@@ -131,7 +131,7 @@ def _info_words(message: Any) -> str:
 
 
 def _odometry_words(message: Any) -> str:
-    decode_odometry(message)
+    stamp_ns(message), decode_pose(message.pose.pose)
     child, parent = (printable(name) or "no named frame" for name in (message.child_frame_id, message.header.frame_id))
     return f"of {child} in {parent}"
 

@@ -53,7 +53,7 @@ from umf_ros.lab.simulation.twin_files import LEAST_OVERLAP, view_overlap
 from umf_ros.replay import Replay
 from umf_ros.runs.findings import look_first
 from umf_ros.runs.reader import FinishedRun, read_run, remember_recording
-from umf_ros.runs.truth import JudgedRun, absolute_trajectory_error, find_revisits, judge_run
+from umf_ros.runs.truth import JudgedRun, clock_offset, find_revisits, judge_run
 from umf_ros.runs.writer import count_drops
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.sensor_check import SensorCheck
@@ -65,9 +65,7 @@ MPRF_APART_S = 100.0
 """A query retrieves nothing that is nearer in time (MPRF, `time_threshold`)."""
 FIXED = 1
 """Quality of positions that relative poses are judged by: a float solution is off by decimetres."""
-ENOUGH_FIXED, LARGEST_LAG_S, LAG_STEP_S, LAG_WINDOW_S = 0.5, 30.0, 0.5, 40.0
-CLEARLY = 0.5
-"""Misfit at another lag, of that without any, below which a clock is called wrong."""
+ENOUGH_FIXED = 0.5
 NOISE = {"pose_graph__odometry_sigma_m": 0.1, "pose_graph__odometry_sigma_deg": 5.0}
 """Of trajectories that are off by 94 m after the crater's kilometre: the defaults, of a tenth of that drift, let the
 graph refuse the one revisit that would set it right (measured on the twin)."""
@@ -126,27 +124,6 @@ def precision_of_pairs(
     return np.asarray(ranking.hits(true)[:, :1].any(axis=1)), np.asarray(true.any(axis=1))
 
 
-def clock_lag_s(odometry: Trajectory, truth: Trajectory) -> float:
-    """Seconds to be added to the stamps of the positions so that they fit the odometry; 0 unless that is clear."""
-    lags = np.arange(-LARGEST_LAG_S, LARGEST_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
-    wanted = np.arange(odometry.stamps_ns[0], odometry.stamps_ns[-1], 10**9)
-    estimate, heard = odometry.at(wanted)
-    misfits = np.full(len(lags), np.nan)
-    for number, lag in enumerate(lags):
-        poses, known = truth.at(wanted - round(lag * 1e9))
-        errors = []
-        for part in np.array_split(np.arange(len(wanted)), max(1, int(len(wanted) / LAG_WINDOW_S))):
-            used = part[known[part] & heard[part]]
-            if len(used) >= LAG_WINDOW_S / 2:
-                errors.append(absolute_trajectory_error(estimate[used, :3, 3], poses[used, :3, 3]))
-        misfits[number] = np.median(errors) if errors else np.nan
-    if np.isnan(misfits).all():
-        return 0.0
-    best, none = int(np.nanargmin(misfits)), int(np.abs(lags).argmin())
-    clear = np.isnan(misfits[none]) or misfits[best] < CLEARLY * misfits[none]
-    return float(lags[best]) if clear and abs(lags[best]) > LAG_STEP_S else 0.0
-
-
 def replay_sequence(one: S3liSequence, folder: Path) -> Record:
     """Replay a sequence with the odometry that is there and judge it by the satellites.
 
@@ -165,8 +142,8 @@ def replay_sequence(one: S3liSequence, folder: Path) -> Record:
             fixed = read_rtklib(found[0], FIXED)
             truth = fixed if fixed.at(run.stamps)[1].mean() >= ENOUGH_FIXED else truth
     about = replace(judge_run(replace(run, truth=truth), recording), sensors=check.report(odometry or run.odometry))
-    if found and odometry is not None and (lag := clock_lag_s(odometry, found[1])):
-        off = f"{abs(lag):.1f} s {'later' if lag < 0 else 'earlier'}"
+    if found and (ahead_s := clock_offset(odometry, found[1])):
+        off = f"{abs(ahead_s):.1f} s {'later' if ahead_s > 0 else 'earlier'}"
         late = f"the odometry fits the satellites' positions {off} than their stamps say"
         notes.append(f"{late}: is {found[0].name} in GPS time? its figures are not to be trusted")
     overlay = about.sensors.overlay
