@@ -198,6 +198,11 @@ class LocalizationSettings(Group):
     update: bool = Field(
         False, description="it becomes a session of the map at ~/save and at the end; needs a folder of results"
     )
+    initial_pose: str = Field(
+        "",
+        description="x and y (m) and heading (deg) in the map where the rover may start, verified like a closure; "
+        "empty: the last pose in results_dir, if there is one",
+    )
 
 
 class TerrainSettings(Group):

@@ -15,6 +15,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -30,6 +31,7 @@ from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics, topics_of
 from umf_ros.core.errors import ConfigError, MessageError, OutputError, UmfError, either, shortened
 from umf_ros.core.io import check_writable
+from umf_ros.map_poses import InitialPose, MapPoses
 from umf_ros.nodes.conversions import from_time, latched, sensor_qos
 from umf_ros.nodes.diagnostics import WARN, InputWatch
 from umf_ros.nodes.parameters import changed_settings, declare
@@ -354,6 +356,26 @@ class BaseNode(LifecycleNode, ABC):
         else:
             self.create_subscription(TFMessage, TOPIC, self._guarded("transforms", transforms.add), STATIC_QOS)
         return BodyFrames(self._settings.frames, transforms, warn, PATIENCE_S, calibration)
+
+    def _follow_initial_pose(self, take: Callable[[MapPoses, InitialPose], None]) -> MapPoses | None:
+        """Pass on the pose where the rover may be: of the parameter or the last run now, of rviz whenever it comes.
+
+        Returns:
+            The poses of the map; None while mapping.
+        """
+        settings = self._settings
+        if not settings.localizing:
+            return None
+        known = MapPoses(Path(settings.map))
+        if (initial := known.initial(settings, self._results)) is not None:
+            take(known, initial)
+
+        def receive(message: PoseWithCovarianceStamped) -> None:
+            take(known, known.from_message(message, settings.frames.map))
+
+        guarded = self._guarded("initial pose", receive)
+        self.create_subscription(PoseWithCovarianceStamped, "initialpose", guarded, 1)
+        return known
 
     def _answer(self, name: str, action: Callable[[Any], str], request: Any) -> tuple[bool, str]:
         """Return the success and the text of a service; any fault is a failure."""

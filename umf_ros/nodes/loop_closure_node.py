@@ -30,6 +30,7 @@ from umf_ros.core.frames import Frame, Keyframe, LoopClosure, State
 from umf_ros.core.geometry import Array, rotation_angle
 from umf_ros.core.io import memory_mb
 from umf_ros.detector import WITHHELD, Detection, LoopDetector, make_detector_embedder
+from umf_ros.map_poses import InitialPose, MapPoses, PoseHint
 from umf_ros.nodes import conversions as messages
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, MAX_LINES, SCAN_FIELDS
@@ -87,6 +88,8 @@ class LoopClosureNode(BaseNode):
         self._lock = threading.Lock()
         self._paused = self._ends_session = False
         self._wanted: Settings | None = None
+        self._hint: PoseHint | None = None
+        self._follow_initial_pose(self._expect)
         self._closures = self._between = 0
         self._last: Detection | None = None
         self._worker: Worker[Frame] = Worker(self._detect, self._report_fault, settings.worker.queue_size)
@@ -143,6 +146,11 @@ class LoopClosureNode(BaseNode):
         if not self._paused:
             self._decoder.submit((topic, message))
 
+    def _expect(self, known: MapPoses, initial: InitialPose) -> None:
+        """Verify an initial pose with the next keyframes."""
+        self.get_logger().info(f"initial pose {initial}: verified like a closure, and searched if it is wrong")
+        self._hint = PoseHint(known.places, initial)
+
     def _take(self, item: tuple[str, Any]) -> None:
         self._router.take(*item)
         for frame in self._synchronizer.pop():
@@ -153,6 +161,8 @@ class LoopClosureNode(BaseNode):
             wanted, self._wanted = self._wanted, None
             if wanted is not None:
                 self._detector.retune(wanted)
+            if self._hint is not None:
+                self._detector.hint, self._hint = self._hint, None
             if self._ends_session:
                 self._ends_session = False
                 self._detector.end_session()
