@@ -241,9 +241,9 @@ def wake(starts: Starts, row: int, initial: InitialPose | None = None) -> tuple[
         localizer.expect(initial)
     detector.hint = None if initial is None else PoseHint(known.places, initial)
     feed, keyframes, found, wrong = OdometrySessionSplitter(localizer), 0, None, False
-    while row and isinstance(starts.stream[row - 1], OdometrySample):
-        row -= 1
-    for item in starts.stream[row:]:
+    since_ns = starts.stream[row].stamp_ns - 10**9
+    before = [one for one in starts.stream[:row] if isinstance(one, OdometrySample) and one.stamp_ns > since_ns]
+    for item in before + starts.stream[row:]:
         if isinstance(item, OdometrySample):
             feed.take(item.stamp_ns, item.odom_T_body)
         else:
