@@ -30,7 +30,6 @@ from umf_ros.verification.hypothesis import IMAGE
 
 if TYPE_CHECKING:
     from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatcher
-    from umf_ros.map_poses import PoseHint
     from umf_ros.submaps.history import SubmapHistory
 
 logger = logging.getLogger(__name__)
@@ -154,7 +153,8 @@ class LoopDetector:
         seen: its places while it localises in a map that grows, in sessions of their own; None: they are not kept.
         inter_robot: closures with other rovers of a fleet; None of a rover on its own.
         sensors: check of all frames, in a thread of its own; what it finds impossible withholds closures.
-        hint: places of the map near a pose that the rover may have, verified first; None: searched only.
+        hint: poses `match_T_query` by stamps of places of the map near where the rover may be, verified first, as a
+            function of the keyframe; None: searched only.
         embedder_name: name of the network.
         embed_ms: milliseconds that the last embedding took, prefetched or not.
 
@@ -183,7 +183,7 @@ class LoopDetector:
             self._submaps = SubmapFinder(settings.verification, settings.loop, self.database, self._map)
             self.inter_robot = _connect_fleet(settings, embedder, self._submaps.history)
             opened.pop_all()
-        self.hint: PoseHint | None = None
+        self.hint: Callable[[Keyframe], dict[int, Array]] | None = None
         self._session: int | None = None
         self._stored_session = self.database.next_session
         self._ahead_m = 0.0
@@ -295,15 +295,15 @@ class LoopDetector:
 
     def verify(self, keyframe: Keyframe, candidates: Sequence[Candidate]) -> list[Hypothesis]:
         """Test the candidates geometrically."""
-        if self.hint is not None and (verdicts := self._verify_near(keyframe, self.hint)):
+        if self.hint is not None and (verdicts := self._verify_near(keyframe, self.hint(keyframe))):
             return verdicts
         verdicts = self._verifier.verify(keyframe, [(found, self.database[found.index]) for found in candidates])
         self._warn_without_depth(verdicts)
         return verdicts
 
-    def _verify_near(self, keyframe: Keyframe, hint: PoseHint) -> list[Hypothesis]:
+    def _verify_near(self, keyframe: Keyframe, guesses: dict[int, Array]) -> list[Hypothesis]:
         """Return verdicts with a closure with the places of a hint, by scans or by submaps; empty without any."""
-        candidates, guesses = [], hint.near(keyframe)
+        candidates = []
         if not guesses:
             self.hint = None
         for row in (row for stamp_ns in guesses for row in self.database.store.rows_at(stamp_ns)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -166,8 +167,8 @@ class PoseHint:
         return {int(self._places.stamps_ns[row]): steps[row] for row in rows[:_TRIED]}
 
 
-def hint_of(settings: Settings) -> PoseHint | None:
+def hint_of(settings: Settings) -> Callable[[Keyframe], dict[int, Array]] | None:
     """Return the places near the initial pose of the settings; None where they name none."""
     known = MapPoses(Path(settings.map))
     initial = known.from_settings(settings)
-    return None if initial is None else PoseHint(known.places, initial)
+    return None if initial is None else PoseHint(known.places, initial).near

@@ -239,7 +239,7 @@ def wake(starts: Starts, row: int, initial: InitialPose | None = None) -> tuple[
     localizer = Localizer(known.places, starts.settings.pose_graph)
     if initial is not None:
         localizer.expect(initial)
-    detector.hint = None if initial is None else PoseHint(known.places, initial)
+    detector.hint = None if initial is None else PoseHint(known.places, initial).near
     feed, keyframes, found, wrong = OdometrySessionSplitter(localizer), 0, None, False
     since_ns = starts.stream[row].stamp_ns - 10**9
     before = [one for one in starts.stream[:row] if isinstance(one, OdometrySample) and one.stamp_ns > since_ns]

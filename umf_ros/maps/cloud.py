@@ -151,7 +151,7 @@ def standing(cloud: Array, height_m: float) -> Array:
     rows, columns = np.nonzero(free.reshape(shape) & level)
     if not len(rows):
         raise UmfError("no cell of the cloud where a rover can stand: is it a map in metres, z upwards? (--trajectory)")
-    order = np.lexsort((np.where(rows % 2, -columns, columns), rows))  # to and fro
+    order = np.lexsort((np.where(rows % 2, -columns, columns), rows))  # there and back
     rows, columns = rows[order], columns[order]
     corner = np.floor(cloud[:, :2].min(axis=0) / CELL_M) - 1
     middles = (np.stack([rows, columns], axis=1) + corner + 0.5) * CELL_M

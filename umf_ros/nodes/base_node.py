@@ -34,7 +34,7 @@ from umf_ros.core.io import check_writable
 from umf_ros.map_poses import InitialPose, MapPoses
 from umf_ros.nodes.conversions import from_time, latched, sensor_qos
 from umf_ros.nodes.diagnostics import WARN, InputWatch
-from umf_ros.nodes.parameters import changed_settings, declare
+from umf_ros.nodes.parameters import changed_settings, declare, with_own_odometry
 from umf_ros.nodes.process import Worker, interruptible, log_to
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import OdometrySample
@@ -77,6 +77,7 @@ class BaseNode(LifecycleNode, ABC):
         change_state = self._service_change_state.callback
         self._service_change_state.callback = partial(self._answer_transition, change_state)
         self._settings, self._results = declare(self, results)
+        self._settings = with_own_odometry(self._settings)
         self._input_names, self._finder = wanted, None
         if must_find(self._settings, wanted):
             self._check_results()  # before it waits for topics
@@ -357,26 +358,6 @@ class BaseNode(LifecycleNode, ABC):
             self.create_subscription(TFMessage, TOPIC, self._guarded("transforms", transforms.add), STATIC_QOS)
         return BodyFrames(self._settings.frames, transforms, warn, PATIENCE_S, calibration)
 
-    def _follow_initial_pose(self, take: Callable[[MapPoses, InitialPose], None]) -> MapPoses | None:
-        """Pass on the pose where the rover may be: of the parameter or the last run now, of rviz whenever it comes.
-
-        Returns:
-            The poses of the map; None while mapping.
-        """
-        settings = self._settings
-        if not settings.localizing:
-            return None
-        known = MapPoses(Path(settings.map))
-        if (initial := known.initial(settings, self._results)) is not None:
-            take(known, initial)
-
-        def receive(message: PoseWithCovarianceStamped) -> None:
-            take(known, known.from_message(message, settings.frames.map))
-
-        guarded = self._guarded("initial pose", receive)
-        self.create_subscription(PoseWithCovarianceStamped, "initialpose", guarded, 1)
-        return known
-
     def _answer(self, name: str, action: Callable[[Any], str], request: Any) -> tuple[bool, str]:
         """Return the success and the text of a service; any fault is a failure."""
         try:
@@ -469,3 +450,23 @@ class BaseNode(LifecycleNode, ABC):
             self._settings = settings
             if self._opened:
                 self._retune(settings)
+
+
+def follow_initial_pose(node: BaseNode, take: Callable[[MapPoses, InitialPose], None]) -> MapPoses | None:
+    """Pass on the pose where the rover may be: of the parameter or the last run now, of rviz whenever it comes.
+
+    Returns:
+        The poses of the map; None while mapping.
+    """
+    settings = node._settings
+    if not settings.localizing:
+        return None
+    known = MapPoses(Path(settings.map))
+    if (initial := known.initial(settings, node._results)) is not None:
+        take(known, initial)
+
+    def receive(message: PoseWithCovarianceStamped) -> None:
+        take(known, known.from_message(message, settings.frames.map))
+
+    node.create_subscription(PoseWithCovarianceStamped, "initialpose", node._guarded("initial pose", receive), 1)
+    return known

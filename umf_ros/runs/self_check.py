@@ -18,6 +18,8 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,27 +128,19 @@ def check_run(folder: Path) -> SelfCheck:
         raise UmfError(f"{folder} holds no run: {NAME} is missing")
     settings = load_settings(folder / "config.yaml").pose_graph
     with closing(RunFile(folder, read_only=True)) as file:
-        path = _Path(settings)
-        splitter = OdometrySessionSplitter(path)
+        sessions = Sessions(settings, AbsoluteReference(settings))
+
+        def add(stamp_ns: int, odom_T_body: Array) -> bool:
+            sessions.chains[-1].add(stamp_ns, odom_T_body)
+            return True
+
+        taker: Any = SimpleNamespace(begin_session=sessions.begin, add_odometry=add)
+        splitter = OdometrySessionSplitter(taker)
         for one in file.odometry():
             splitter.take(one.stamp_ns, one.odom_T_body)
         splitter.finish()
         scans = {one.stamp_ns: one.scan.astype(np.float32) * SCAN_UNIT_M for one in file.pictures()}
-        return judge(path.sessions, file.closures(), scans, settings)
-
-
-class _Path:
-    """Odometry in sessions."""
-
-    def __init__(self, settings: PoseGraphSettings) -> None:
-        self.sessions = Sessions(settings, AbsoluteReference(settings))
-
-    def begin_session(self) -> None:
-        self.sessions.begin()
-
-    def add_odometry(self, stamp_ns: int, odom_T_body: Array) -> bool:
-        self.sessions.chains[-1].add(stamp_ns, odom_T_body)
-        return True
+        return judge(sessions, file.closures(), scans, settings)
 
 
 def judge(
