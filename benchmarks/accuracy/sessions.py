@@ -3,7 +3,8 @@
     python benchmarks/accuracy/sessions.py --json sessions.json               # five test worlds, some hours
     python benchmarks/accuracy/sessions.py --quick --seed 20001 --json F      # three short sessions, four cold starts
     python benchmarks/accuracy/sessions.py --both-ways --seed 20001           # every second session the other way round
-    python benchmarks/accuracy/sessions.py --initial-pose --quick --lidar-only --seed 20001
+    python benchmarks/accuracy/sessions.py --initial --quick --lidar-only --seed 20001
+    python benchmarks/accuracy/sessions.py --cloud --both-ways --quick --lidar-only --seed 20001
     python benchmarks/accuracy/sessions.py --grow --quick --seed 20001        # a map that grows where one localises
 
 Every session drives a part of one way of 100 m by a route, light and noise of its own; the world repeats itself
@@ -15,7 +16,8 @@ the images, which take most of the time. With `--grow`, a map is made of the fir
 localise in it with `localization.update`, and the fourth localises in the map of the first alone and in the grown one;
 prints and writes of both `keyframes`, those with a true closure (`closed`), and `wrong` closures.
 
-With `--initial-pose`, every cold start is repeated with an initial pose: right (off by a click: .3 m, 5 deg), wrong by
+With `--cloud`, the cloud of the map (`map.ply`) is imported along the trajectory of its first session, and visitors in
+both directions wake up there; prints as the next does. With `--initial`, every cold start is repeated with an initial pose: right (off by a click: .3 m, 5 deg), wrong by
 5 m, by 200 m, the last pose of a run, and that of a run elsewhere (kidnapped); prints the keyframes until the pose was
 known, None where it was not, and how many starts were ever `wrong`.
 
@@ -34,6 +36,8 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -74,6 +78,8 @@ from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 WITHIN_KEYFRAMES = 20
+CLOUD_STARTS = 10
+"""Cold starts of each visitor in an imported map."""
 WRONG_M, WRONG_DEG = 1.0, 5.0
 OVERLAP_M = 20.0
 Stream = list[Frame | OdometrySample | AbsoluteMeasurement]
@@ -297,7 +303,22 @@ def initial_poses(starts: Starts) -> dict[str, Any]:
     return {"keyframes": found, "wrong": wrong}
 
 
-def run_world(world: int, size: Size, work: Path, both_ways: bool, initial: bool = False) -> dict[str, Any]:
+def in_cloud(folder: MapFolder, joint: JointMap, truths: dict[str, Trajectory], visitors: list[Path]) -> dict[str, Any]:
+    """Keyframes until cold starts knew their pose in the map that is imported from the cloud of another, and wrong ones."""
+    out, path = folder.path.with_name("map_cloud"), next(folder.path.glob("trajectories/*.tum"))
+    if not (out / "map.json").exists():
+        command = ["map", "import-cloud", folder.path / "map.ply", "--trajectory", path, "--fov", "70", "--out", out]
+        subprocess.run([sys.executable, "-m", "umf_ros.cli", *map(str, command)], check=True)
+    found: dict[str, Any] = {"wrong": 0}
+    for visitor in visitors:
+        starts = cold_starts(MapFolder.open(out), joint, truths, visitor, CLOUD_STARTS, 0.0)
+        ends = [wake(starts, row) for row in starts.rows]
+        found[visitor.stem] = [keyframes for keyframes, _ in ends]
+        found["wrong"] += sum(is_wrong for _, is_wrong in ends)
+    return found
+
+
+def run_world(world: int, size: Size, work: Path, both_ways: bool, what: str = "") -> dict[str, Any]:
     """All figures of one world."""
     work.mkdir(parents=True, exist_ok=True)
     numbers = range(1, size.sessions + 1)
@@ -305,9 +326,12 @@ def run_world(world: int, size: Size, work: Path, both_ways: bool, initial: bool
     visitor = simulated(work, world, size.sessions + 1, size, both_ways)
     truths = {recording.stem: truth_of(recording) for recording in recordings}
     folder, joint, summary = mapped(work / "map", recordings)
+    if what == "cloud":
+        visitors = [simulated(work, world, size.sessions + 1, size, back) for back in (False, True)]
+        return {"world": world, **in_cloud(folder, joint, truths, visitors)}
     known = mapped(work / "map_one_way", recordings[::2])[:2] if both_ways else (folder, joint)
     visits = cold_starts(*known, truths, visitor, size.starts, np.pi * both_ways)
-    if initial:
+    if what == "initial":
         return {"world": world, **initial_poses(visits)}
     starts = [wake(visits, row) for row in visits.rows]
     found = [keyframes for keyframes, _ in starts if keyframes is not None]
@@ -395,7 +419,10 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="three sessions of 40 s, four cold starts")
     parser.add_argument("--both-ways", action="store_true", help="sessions in both directions, cold starts against it")
     parser.add_argument("--grow", action="store_true", help="a fourth session in a map that grew, or did not")
-    parser.add_argument("--initial-pose", action="store_true", help="cold starts with right and wrong initial poses")
+    for name, text in (("initial", "with right and wrong initial poses"), ("cloud", "in a map that is imported")):
+        parser.add_argument(
+            f"--{name}", dest="what", action="store_const", const=name, default="", help=f"starts {text}"
+        )
     parser.add_argument("--lidar-only", action="store_true", help="without images")
     parser.add_argument("--seed", type=int, help="seed of a single world")
     parser.add_argument(
@@ -415,9 +442,9 @@ def main() -> None:
     worlds = []
     for world in seeds(arguments.seed):
         folder = arguments.work / f"{kind}_{world}"
-        worlds.append(run_world(world, size, folder, arguments.both_ways, arguments.initial_pose))
+        worlds.append(run_world(world, size, folder, arguments.both_ways, arguments.what))
         print(json.dumps(worlds[-1]), flush=True)
-    figures = {"worlds": worlds} if arguments.initial_pose else summarise(worlds)
+    figures = {"worlds": worlds} if arguments.what else summarise(worlds)
     print(json.dumps({name: value for name, value in figures.items() if name != "worlds"}, indent=2))
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
