@@ -17,9 +17,9 @@ localise in it with `localization.update`, and the fourth localises in the map o
 prints and writes of both `keyframes`, those with a true closure (`closed`), and `wrong` closures.
 
 With `--cloud`, the cloud of the map (`map.ply`) is imported along the trajectory of its first session, and visitors in
-both directions wake up there; prints as the next does. With `--initial`, every cold start is repeated with an initial pose: right (off by a click: .3 m, 5 deg), wrong by
-5 m, by 200 m, the last pose of a run, and that of a run elsewhere (kidnapped); prints the keyframes until the pose was
-known, None where it was not, and how many starts were ever `wrong`.
+both directions wake up there: keyframes until the pose was known, None where it was not, and how many starts were ever
+`wrong`. With `--initial`, the same of cold starts with an initial pose: right (off by a click: .3 m, 5 deg), wrong by
+5 m, by 200 m, the last pose of a run, and that of a run elsewhere (kidnapped).
 
 Prints and writes, over all worlds:
 - `wrong_between`: closures between sessions that the map believes and the truth refutes (0.5 m, 5 deg);
@@ -304,7 +304,7 @@ def initial_poses(starts: Starts) -> dict[str, Any]:
 
 
 def in_cloud(folder: MapFolder, joint: JointMap, truths: dict[str, Trajectory], visitors: list[Path]) -> dict[str, Any]:
-    """Keyframes until cold starts knew their pose in the map that is imported from the cloud of another, and wrong ones."""
+    """Keyframes until cold starts in the map of a cloud knew their pose, by visitor, and wrong ones."""
     out, path = folder.path.with_name("map_cloud"), next(folder.path.glob("trajectories/*.tum"))
     if not (out / "map.json").exists():
         command = ["map", "import-cloud", folder.path / "map.ply", "--trajectory", path, "--fov", "70", "--out", out]
@@ -419,7 +419,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="three sessions of 40 s, four cold starts")
     parser.add_argument("--both-ways", action="store_true", help="sessions in both directions, cold starts against it")
     parser.add_argument("--grow", action="store_true", help="a fourth session in a map that grew, or did not")
-    for name, text in (("initial", "with right and wrong initial poses"), ("cloud", "in a map that is imported")):
+    for name, text in (("initial", "cold starts with initial poses"), ("cloud", "in the cloud of a map")):
         parser.add_argument(
             f"--{name}", dest="what", action="store_const", const=name, default="", help=f"starts {text}"
         )
