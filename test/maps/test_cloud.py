@@ -125,6 +125,18 @@ def test_the_map_keeps_the_frame_of_the_cloud(imported: Path) -> None:
     assert np.allclose(np.sort(poses[:17, 0, 3]), np.arange(-8, 8.1, 1.0), atol=1e-3)
 
 
+def test_a_trajectory_in_another_frame_and_a_folder_with_files_are_refused(tmp_path: Path, imported: Path) -> None:
+    cloud = imported.parent / "yard.ply"
+    far = np.stack([turned(1000.0 + x, 0.0, 5.0 * x, 1.0) for x in range(4)])
+    write_tum(tmp_path / "far.tum", Trajectory(np.arange(4) * 10**9, far))
+    config = ("--config", imported.parent / "config.yaml")
+    done = umf("map", "import-cloud", cloud, "--trajectory", tmp_path / "far.tum", *config, "--out", tmp_path / "map")
+    assert done.status == 1 and "is the trajectory in its frame" in done.err
+    before = (imported / "map.json").read_bytes()
+    done = umf("map", "import-cloud", cloud, "--out", imported)
+    assert done.status == 1 and "nothing was written" in done.err and (imported / "map.json").read_bytes() == before
+
+
 def test_clouds_that_are_none_are_one_line(tmp_path: Path) -> None:
     points = invert(np.eye(4)[None])[0][:3, :3].repeat(100, axis=0) * np.linspace(1, 30, 300)[:, None]
     assert len(read_cloud(write_cloud(tmp_path / "good.pcd", points))) > 200

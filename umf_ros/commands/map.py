@@ -224,6 +224,8 @@ def import_cloud(
     from umf_ros.maps.outputs import write_results
 
     options.check_files(cloud, config, trajectory)
+    if out.exists() and any(out.iterdir()):
+        raise ConfigError(f"{out} holds files already: import a cloud into a folder of its own; nothing was written")
     console, settings = Console(), load_settings(config)
     lidar = clouds.VirtualLidar(fov, low, high, height_m=height)
     with Progress(console=console, transient=True) as bar:

@@ -185,7 +185,11 @@ class CloudViews:
 def import_cloud(
     target: MapFolder, path: Path, views: CloudViews, embedder: Embedder, on_place: Callable[[], None] = lambda: None
 ) -> int:
-    """Add the views of the cloud of a file to a map; return their number."""
+    """Add the views of the cloud of a file to a map; return their number.
+
+    Raises:
+        UmfError: nothing is seen from the poses.
+    """
     first, count = dict[int, tuple[int, Array]](), 0
     for turn_deg in views.headings_deg:
         rows, turn = views.order(turn_deg), Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
@@ -195,6 +199,8 @@ def import_cloud(
             on_place()
             if place is not None:
                 places[row] = place
+        if not places:
+            raise UmfError(f"{path}: no view has {_FEWEST} points: is the trajectory in its frame, in metres?")
         for row in places.keys() & first.keys():
             (match_ns, match_pose), place = first[row], places[row]
             step = relative(match_pose, walked[stamps.index(place.stamp_ns)].odom_T_body)
