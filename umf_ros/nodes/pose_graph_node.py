@@ -300,8 +300,8 @@ class PoseGraphNode(BaseNode):
         if not self._is_behind:
             self._durable.prepare(PREPARE_S)
         self._correct()
-        self._keep_pose()
         self._show()
+        self._keep_pose()
 
     def _own_status(self) -> DiagnosticStatus:
         state = self._state

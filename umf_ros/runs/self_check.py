@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -40,24 +41,24 @@ from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 TABLE = "self_check.csv"
 COLUMNS = ("query_stamp_ns", "match_stamp_ns", "probability", "support", "overlap", "overlap_beside")
-# residual of a loop with a wrong closure beyond its noise: standard deviations, rad and m
-_WRONG = np.diag([0.3] * 3 + [5.0] * 3) ** 2
-_MOST_COMPARED, _ROUNDS, _DAMPING = 60, 15, 0.7
+# loops, by hand: standard deviations of the residual with a wrong closure beyond its noise, rad and m; factor of the
+# stated noise of closures; closures that one is compared with
+_WRONG, _CLOSURE_NOISE, _MOST_COMPARED = np.diag([0.3] * 3 + [5.0] * 3) ** 2, 1.5, 60
 # nats: of one place for and against a closure, of closures of its own place for it, of all places for and against it.
 # Loops of tens of metres agree with poses that are off by a metre: overlap has to say more for a closure (*by hand*)
 _PER_PLACE, _OF_OWN_PLACE, _MOST_FOR, _MOST_AGAINST = 4.0, 1.0, 2.0, 12.0
-_CLOSURE_NOISE = 1.5
-_USUAL = np.log(9.0)
-# local maps: metres of path to each side, scans, sides of cubes, of columns in which both see
-# something, points compared
-_REACH_M, _CUBE_M, _COLUMN_M, _COMPARED, _FEWEST = 8.0, 0.2, 1.0, 600, 50
-_NEAR_M = 0.2
-_ANGLES = np.arange(8) * np.pi / 4
-_MERGED = 12
-_SHIFTS_M = np.array([(0.0, 0.0, 0.0), *((m * np.cos(a), m * np.sin(a), 0.0) for m in (1, 2, 3) for a in _ANGLES)])
+_ROUNDS, _DAMPING = 15, 0.7
+# local maps, by hand: metres of path to each side, and scans there; sides of cubes that keep a point, and of columns in
+# which both maps see something; points compared, at most and at least; distance of a matched point; poses beside, m
+_REACH_M, _SCANS, _CUBE_M, _COLUMN_M, _COMPARED, _FEWEST, _NEAR_M = 8.0, 12, 0.2, 1.0, 600, 50, 0.2
+_BESIDE = [(m * np.cos(a), m * np.sin(a), 0.0) for m in (1, 2, 3) for a in np.arange(8) * np.pi / 4]
+_SHIFTS_M = np.array([(0.0, 0.0, 0.0), *_BESIDE])
+# closures whose local maps are compared, evenly chosen, and local maps in memory: a minute and 20 MB
+_MOST_OVERLAPS, _MAPS_KEPT = 2000, 64
 # log-odds by overlap, of that which the best quarter of closures reach, and by overlap less that beside: fitted on the
-# runs of seeds 10001 to 10004, whose right closures have .69 or more of it, and planted ones .55 or less
+# runs of seeds 10001 to 10004, whose right closures have .69 or more of it, and planted ones .55 or less; without scans
 _OFFSET, _BY_OVERLAP, _BY_CONTRAST, _REACHED, _LEAST_REACHED = -6.0, 11.7, 4.6, 0.75, 0.5
+_USUAL = np.log(9.0)
 _Z = 1.96
 
 
@@ -217,15 +218,14 @@ def _evidence(one: Closures, others: Closures) -> Array:
 
 def _overlaps(placed: list[PlacedClosure], scans: dict[int, Array], sessions: Sessions) -> Array:
     """Return (N, 2) overlap of local maps at the poses of closures, and the largest beside; NaN without scans."""
-    stamps = np.array(sorted(scans), np.int64)
-    found, maps = np.full((len(placed), 2), np.nan), dict[tuple[int, int], NDArray[np.floating]]()
+    stamps, found = np.array(sorted(scans), np.int64), np.full((len(placed), 2), np.nan)
 
+    @lru_cache(_MAPS_KEPT)
     def local_map(session: int, stamp_ns: int) -> NDArray[np.floating]:
-        if (session, stamp_ns) not in maps:
-            maps[session, stamp_ns] = _local_map(sessions, session, stamp_ns, stamps, scans)
-        return maps[session, stamp_ns]
+        return _local_map(sessions, session, stamp_ns, stamps, scans)
 
-    for row, (match, query, closure) in enumerate(placed):
+    for row in evenly(len(placed), _MOST_OVERLAPS).tolist():
+        match, query, closure = placed[row]
         theirs, ours = local_map(match, closure.match_stamp_ns), local_map(query, closure.query_stamp_ns)
         if min(len(theirs), len(ours)) >= _FEWEST:
             found[row] = _overlap(theirs, ours[evenly(len(ours), _COMPARED)], closure.match_T_query)
@@ -240,7 +240,7 @@ def _local_map(
     known = stamps[chain.covers(stamps)]
     here, points = chain.at(np.array([stamp_ns])), chain.at(known)
     near = np.flatnonzero(np.abs(points["travel"] - here["travel"]) <= _REACH_M)
-    near = near[evenly(len(near), _MERGED)]
+    near = near[evenly(len(near), _SCANS)]
     steps = invert(here["pose"]) @ points["pose"][near]
     merged = [np.empty((0, 3), np.float32)]
     merged += [transform(step, scans[stamp]) for step, stamp in zip(steps, known[near].tolist(), strict=True)]
