@@ -16,7 +16,7 @@ from umf_ros.core.geometry import Array, invert, make_pose, relative, rotation_a
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.simulation.scenes import yard_scan
-from umf_ros.map_poses import MapPoses
+from umf_ros.map_poses import MapPoses, hint_of
 from umf_ros.maps.cloud import VirtualLidar, along, read_cloud, standing
 from umf_ros.maps.outputs import CLOUD, write_points
 
@@ -117,6 +117,22 @@ def test_a_lidar_alone_is_localised_in_both_directions(imported: Path, yaw_deg: 
     detector.close()
     assert len(found) >= 3
     assert all(np.linalg.norm(gap[:3, 3]) < 0.3 and np.degrees(rotation_angle(gap)) < 2 for gap in found)
+
+
+@pytest.mark.parametrize("told", ["-3.3 0.6 4", "1.7 0.6 4", "200 0 0"])
+def test_an_initial_pose_is_verified_and_a_wrong_one_searched(imported: Path, told: str) -> None:
+    settings, pose = settings_in(imported), turned(-3.3, 0.6, 4.0, 0.1)
+    detector = LoopDetector(settings, make_detector_embedder(settings))
+    detector.hint = hint_of(load_settings(mode="localization", map=str(imported), localization__initial_pose=told))
+    points = yard_scan(YARD, pose)
+    frame = replace(make_frame(10.0, np.eye(4)), points=points, intensity=np.ones(len(points), np.float32))
+    detection, known = detector.process(frame), MapPoses(imported).places
+    (closure,) = detection.closures
+    match = known.poses[np.flatnonzero(known.stamps_ns == closure.match_stamp_ns)[0]]
+    assert np.linalg.norm(relative(pose, match @ closure.match_T_query)[:3, 3]) < 0.3
+    assert detector.hint is None
+    assert (len(detection.verdicts) == 4) != told.startswith("200")  # the places near it, and no others
+    detector.close()
 
 
 def test_the_map_keeps_the_frame_of_the_cloud(imported: Path) -> None:

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2
 
-from umf_ros.core.config import Settings, load_settings
+from umf_ros.core.config import load_settings
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.geometry import make_pose
 from umf_ros.core.resources import ODOMETRY_ENGINES
@@ -69,7 +69,6 @@ def test_scans_become_odometry_for_both_nodes_and_no_transform(rover: Node, tmp_
 
 
 def test_engine_and_topic_of_the_odometry_are_not_both_named() -> None:
-    assert with_own_odometry(Settings()) == Settings()
     assert with_own_odometry(load_settings(odometry__engine=ODOMETRY_ENGINES[0])).topics.odometry == MADE_ODOMETRY
     with pytest.raises(ConfigError, match=r"leave one of them"):
         with_own_odometry(load_settings(odometry__engine="vgicp", topics__odometry="/wheels"))
