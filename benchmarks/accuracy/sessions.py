@@ -54,7 +54,7 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Frame
-from umf_ros.core.geometry import Array, align, heading, relative, rotation_angle, wrap_angle
+from umf_ros.core.geometry import Array, align, heading, make_pose, relative, rotation_angle, wrap_angle
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.simulation.bag_writer import BagWriter
@@ -310,7 +310,9 @@ def in_cloud(folder: MapFolder, joint: JointMap, truths: dict[str, Trajectory], 
     """
     out, found = folder.path.with_name("map_cloud"), dict[str, Any](wrong=0)
     if not (out / "map.json").exists():
-        poses, path = np.concatenate([one.poses for one in joint.sessions]), folder.path.with_name("poses.tum")
+        body_T_mast = make_pose(np.eye(3), [0.38, 0.0, 1.27])  # the LiDAR's place, with the axes of the body
+        poses = np.concatenate([one.poses @ body_T_mast for one in joint.sessions])
+        path = folder.path.with_name("poses.tum")
         write_tum(path, Trajectory(np.arange(len(poses)) * 10**9, poses))
         command = ["map", "import-cloud", folder.path / "map.ply", "--trajectory", path, "--fov", "70", "--out", out]
         subprocess.run([sys.executable, "-m", "umf_ros.cli", *map(str, command)], check=True)

@@ -203,7 +203,8 @@ def import_cloud(
             raise UmfError(f"{path}: no view has {_FEWEST} points: is the trajectory in its frame, in metres?")
         for row in places.keys() & first.keys():
             (match_ns, match_pose), place = first[row], places[row]
-            step = relative(match_pose, walked[stamps.index(place.stamp_ns)].odom_T_body)
+            assert place.odom_T_body is not None
+            step = relative(match_pose, place.odom_T_body)
             between.append(LoopClosure(place.stamp_ns, match_ns, step, _EXACT, 0.999))
         about = {"path": str(path.resolve()), "start_ns": walked[0].stamp_ns, "end_ns": walked[-1].stamp_ns}
         drive = Drive(f"{path.stem}_{turn_deg:.0f}", walked, list(places.values()), between)
