@@ -9,6 +9,7 @@ from umf_ros.core.frames import LoopClosure, State
 from umf_ros.core.geometry import Array, expmap, invert, make_pose, relative, rotation_angle
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.localizer import ACCEPTED_ODDS, Localizer
+from umf_ros.map_poses import MIN_SIGMAS, InitialPose
 from umf_ros.pose_graph.closures import ClosureReason
 
 SECOND_NS = 10**9
@@ -217,3 +218,35 @@ def test_origin_of_the_odometry_does_not_matter() -> None:
         assert ours is not None and theirs is not None
         gap = invert(ours.map_T_body) @ theirs.map_T_body
         assert np.linalg.norm(gap[:3, 3]) < 0.1
+
+
+def initial(at_m: float) -> InitialPose:
+    """A click beside a metre of the circle."""
+    pose = on_circle(np.array([at_m]))[0] @ make_pose(np.eye(3), [0.2, -0.3, 0.0])
+    return InitialPose(pose, np.diag(MIN_SIGMAS**2))
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_an_initial_pose_is_a_pose_with_the_first_closure_that_agrees(late: bool) -> None:
+    rover = Drive(37)
+    if not late:
+        rover.localizer.begin_session()
+        rover.localizer.expect(initial(37.0))  # before any odometry
+        rover.drive(0.25)
+    else:
+        rover.localizer.expect(initial(37.0))
+    assert rover.localizer.estimate() is None  # it is no fact
+    rover.localizer.add_closure(rover.closure(probability=0.95))
+    assert rover.error_m() < 0.15
+
+
+@pytest.mark.parametrize("off_m", [5.0, 30.0])
+def test_a_wrong_initial_pose_is_given_up_for_closures(off_m: float) -> None:
+    rover, other = Drive(37), Drive(37)
+    rover.localizer.expect(initial(37.0 + off_m))
+    for _ in range(7):
+        known = [one.localizer.estimate() is not None for one in (rover, other)]
+        assert known[0] == known[1]
+        for one in (rover, other):
+            one.drive(1).localizer.add_closure(one.closure())
+    assert rover.error_m() < 0.15 and rover.localizer.relocalised == 1

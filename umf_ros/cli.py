@@ -25,6 +25,7 @@ COMMANDS = {
     "replay": "umf_ros.commands.replay",
     "slam": "umf_ros.commands.slam",
     "map": "umf_ros.commands.map:app",
+    "judge": "umf_ros.commands.judge",
     "compare": "umf_ros.lab.commands.compare",
     "sensors": "umf_ros.lab.commands.evaluate:sensors",
     "play": "umf_ros.lab.commands.demo:play",

@@ -153,6 +153,8 @@ class LoopDetector:
         seen: its places while it localises in a map that grows, in sessions of their own; None: they are not kept.
         inter_robot: closures with other rovers of a fleet; None of a rover on its own.
         sensors: check of all frames, in a thread of its own; what it finds impossible withholds closures.
+        hint: poses `match_T_query` by stamps of places of the map near where the rover may be, verified first, as a
+            function of the keyframe; None: searched only.
         embedder_name: name of the network.
         embed_ms: milliseconds that the last embedding took, prefetched or not.
 
@@ -181,6 +183,7 @@ class LoopDetector:
             self._submaps = SubmapFinder(settings.verification, settings.loop, self.database, self._map)
             self.inter_robot = _connect_fleet(settings, embedder, self._submaps.history)
             opened.pop_all()
+        self.hint: Callable[[Keyframe], dict[int, Array]] | None = None
         self._session: int | None = None
         self._stored_session = self.database.next_session
         self._ahead_m = 0.0
@@ -218,6 +221,8 @@ class LoopDetector:
             verdicts = self.verify(keyframe, candidates)
         with _timed(latency, "submaps"):
             verdicts = self.match_submaps(keyframe, verdicts)
+        if any(one.accepted for one in verdicts):
+            self.hint = None  # odometry carries the pose on from the closure
         self._withhold(verdicts)
         detection = Detection(frame.stamp_ns, keyframe, verdicts, latency | {"total": sum(latency.values())})
         publish(detection)
@@ -290,9 +295,25 @@ class LoopDetector:
 
     def verify(self, keyframe: Keyframe, candidates: Sequence[Candidate]) -> list[Hypothesis]:
         """Test the candidates geometrically."""
+        if self.hint is not None and (verdicts := self._verify_near(keyframe, self.hint(keyframe))):
+            return verdicts
         verdicts = self._verifier.verify(keyframe, [(found, self.database[found.index]) for found in candidates])
         self._warn_without_depth(verdicts)
         return verdicts
+
+    def _verify_near(self, keyframe: Keyframe, guesses: dict[int, Array]) -> list[Hypothesis]:
+        """Return verdicts with a closure with the places of a hint, by scans or by submaps; empty without any."""
+        candidates = []
+        if not guesses:
+            self.hint = None
+        for row in (row for stamp_ns in guesses for row in self.database.store.rows_at(stamp_ns)):
+            similarity = float(self.database.store.descriptors(np.array([row]))[0] @ keyframe.embedding.descriptor)
+            candidates.append(Candidate(row, self.database[row].stamp_ns, similarity))
+        offered = [(found, self.database[found.index]) for found in candidates]
+        verdicts = self._verifier.verify(keyframe, offered, guesses)
+        if not any(one.accepted for one in verdicts):
+            verdicts = self._submaps.compare(keyframe, candidates, guesses)
+        return verdicts if any(one.accepted for one in verdicts) else []
 
     def match_submaps(self, keyframe: Keyframe, verdicts: list[Hypothesis]) -> list[Hypothesis]:
         """Return the verdicts, accepted ones first, with those of submaps where the scans gave no closure."""

@@ -19,6 +19,7 @@ from umf_ros.core.errors import GraphError, OutputError, writing
 from umf_ros.core.frames import GraphState, LoopClosure
 from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import Schema, SqliteFile
+from umf_ros.map_poses import InitialPose
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, Decision, State
 from umf_ros.pose_graph.odometry import Stamps
@@ -166,6 +167,10 @@ class DurableGraph:
         verdicts = self.graph.add_by_hand(closure)
         self._log(_row(closure), _mark_of("accepted", *closure.pair))
         return self._logged(verdicts)
+
+    def expect(self, initial: InitialPose) -> None:
+        """See `Localizer.expect`; a graph is no localizer, and ignores it."""
+        getattr(self.graph, "expect", lambda _: None)(initial)
 
     def verdicts_on(self, match_ns: int, query_ns: int) -> list[ClosureVerdict]:
         """Return the latest verdicts on the closures between two keyframes."""

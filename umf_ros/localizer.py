@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, log
+from math import exp, inf, log
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from umf_ros.absolute.measurement import AbsoluteMeasurement
 from umf_ros.core.config import PoseGraphSettings, Settings
-from umf_ros.core.errors import GraphError, UmfError, one_line, writing
+from umf_ros.core.errors import GraphError, writing
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import (
     Array,
@@ -28,16 +28,14 @@ from umf_ros.core.geometry import (
     relative,
     ros_to_gtsam_covariance,
 )
-from umf_ros.core.limits import open_archive
 from umf_ros.core.odometry_noise import OdometryNoise
 from umf_ros.core.trajectory import Trajectory, write_tum
+from umf_ros.map_poses import InitialPose, MapPoses
 from umf_ros.pose_graph.backend import MAX_WAITING, Key, PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason, ClosureVerdict, State, check_closure, check_pose
 
 ACCEPTED_ODDS = log(0.999 / 0.001)
 """Least odds of a reported pose, nats (*by hand*: one wrong in a thousand)."""
-POSES = "poses.npz"
-"""In the folder of a map, its places with a pose: `stamps` (N,) on the map's clock, `poses` (N, 4, 4) `map_T_body`."""
 _MOST_PER_CLOSURE = log(0.99 / 0.01)
 # neighbouring places look like the same wrong place: consecutive closures count by the path length between them
 _NATS_PER_M = 1.0
@@ -96,10 +94,10 @@ class _PoseHypothesis:
 class Localizer(PoseGraph):
     """Localisation in a fixed map by pose hypotheses from closures and odometry, with the interface of a pose graph.
 
-    A closure that agrees with no hypothesis adds one. Later closures agree with a hypothesis or contradict it, within
-    the covariances of closure and odometry, and change its odds by the path length between them. The pose is that of
-    the accepted hypothesis until another one is accepted, so a kidnapped rover is relocalised. Closures are counted and
-    not kept.
+    A closure that agrees with no hypothesis adds one, and so does an initial pose, which counts as one closure. Later
+    closures agree with a hypothesis or contradict it, within the covariances of closure and odometry, and change its
+    odds by the path length between them. The pose is that of the accepted hypothesis until another one is accepted, so
+    a kidnapped rover is relocalised. Closures are counted and not kept.
 
     `poses` are those of the map's keyframes, by the stamps that closures name as their match.
 
@@ -116,6 +114,7 @@ class Localizer(PoseGraph):
         self.relocalised = 0
         self.reasons: Counter[ClosureReason] = Counter()
         self._decided: list[ClosureVerdict] = []
+        self._initial: InitialPose | None = None
         self.begin_session()
 
     def begin_session(self) -> None:
@@ -125,6 +124,15 @@ class Localizer(PoseGraph):
         self._received: dict[Key, None] = {}
         self._hypotheses: list[_PoseHypothesis] = []
         self._accepted: _PoseHypothesis | None = None
+
+    def expect(self, initial: InitialPose) -> None:
+        """Add a pose that the rover may have now, or at its first odometry, with the odds of one closure."""
+        if not self._samples:
+            self._initial = initial
+            return
+        self._initial = None
+        pose, covariance = initial.map_T_body, ros_to_gtsam_covariance(initial.covariance, initial.map_T_body)
+        self._hypotheses.append(_PoseHypothesis(self._samples[-1], pose, covariance, _MOST_PER_CLOSURE, -inf))
 
     def add_odometry(self, stamp_ns: int, odom_T_body: Array, covariance: Array | None = None) -> bool:
         """Add an odometry message; return whether it was usable."""
@@ -140,6 +148,8 @@ class Localizer(PoseGraph):
             # a stationary rover gathers no evidence
             path_m = last.path_m + float(self._noise.path_lengths(last.pose[None], odom_T_body[None], np.zeros(1))[0])
         self._samples.append(_Sample(stamp_ns, np.asarray(odom_T_body, float), path_m))
+        if self._initial is not None:
+            self.expect(self._initial)
         for _ in range(len(self._early)):
             decided = self._add(self._early.popleft())
             self._decided += [verdict for verdict in decided if verdict.reason is not ClosureReason.NO_ODOMETRY_YET]
@@ -319,19 +329,13 @@ def _logit(probability: float) -> float:
     return log(known / (1 - known))
 
 
-def read_poses(path: Path) -> Trajectory:
-    """Read the poses of a map's places, on the map's clock; raise an `UmfError` if the map has not been solved."""
-    try:
-        with open_archive(path / POSES), np.load(path / POSES) as stored:
-            return Trajectory(stored["stamps"], stored["poses"])
-    except Exception as error:  # damaged bytes raise any exception
-        cause = one_line(error)
-        raise UmfError(f"{path / POSES} cannot be read ({cause}): run umf map to solve the map") from None
-
-
 def open_localizer(settings: Settings) -> Localizer:
-    """Return a localizer in the map of the settings; raise an `UmfError` if it has not been solved."""
-    return Localizer(read_poses(Path(settings.map)), settings.pose_graph)
+    """Return a localizer in the map of the settings, with their initial pose; raise an `UmfError` if there is none."""
+    known = MapPoses(Path(settings.map))
+    localizer = Localizer(known.places, settings.pose_graph)
+    if (initial := known.from_settings(settings)) is not None:
+        localizer.expect(initial)
+    return localizer
 
 
 _STATES = {

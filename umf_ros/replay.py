@@ -14,6 +14,7 @@ from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Frame, LoopClosure
 from umf_ros.detector import Detection, LoopDetector
 from umf_ros.localizer import Localization, Localizer, open_localizer
+from umf_ros.map_poses import hint_of
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason
 from umf_ros.runs.writer import RunRecorder, write_summary
@@ -53,6 +54,8 @@ class Replay:
         self._folder = folder
         self._detector = detector
         self._localizer = open_localizer(settings) if settings.localizing else None
+        if settings.localizing:
+            detector.hint = hint_of(settings)
         self._graph = self._localizer or PoseGraph(settings.pose_graph)
         self._recorder = RunRecorder(folder, settings, detector.embedder_name, resume)
         self._feed = OdometrySessionSplitter(self._graph)

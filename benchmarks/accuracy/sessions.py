@@ -3,6 +3,8 @@
     python benchmarks/accuracy/sessions.py --json sessions.json               # five test worlds, some hours
     python benchmarks/accuracy/sessions.py --quick --seed 20001 --json F      # three short sessions, four cold starts
     python benchmarks/accuracy/sessions.py --both-ways --seed 20001           # every second session the other way round
+    python benchmarks/accuracy/sessions.py --what initial --quick --lidar-only --seed 20001
+    python benchmarks/accuracy/sessions.py --what cloud --quick --lidar-only --seed 20001
     python benchmarks/accuracy/sessions.py --grow --quick --seed 20001        # a map that grows where one localises
 
 Every session drives a part of one way of 100 m by a route, light and noise of its own; the world repeats itself
@@ -13,6 +15,11 @@ the map of the other sessions, all driven against its direction. The LiDAR is 70
 the images, which take most of the time. With `--grow`, a map is made of the first session, the second and the third
 localise in it with `localization.update`, and the fourth localises in the map of the first alone and in the grown one;
 prints and writes of both `keyframes`, those with a true closure (`closed`), and `wrong` closures.
+
+With `--what cloud`, the cloud of the map (`map.ply`) is imported along the trajectories of its sessions, and visitors
+in both directions wake up there: keyframes until the pose was known, None where it was not, and how many starts were
+ever `wrong`. With `--what initial`, the same of cold starts with an initial pose: right (off by a click: .3 m, 5 deg),
+wrong by 5 m, by 200 m, the last pose of a run, and that of a run elsewhere (kidnapped).
 
 Prints and writes, over all worlds:
 - `wrong_between`: closures between sessions that the map believes and the truth refutes (0.5 m, 5 deg);
@@ -29,11 +36,14 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,8 +54,8 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Frame
-from umf_ros.core.geometry import Array, align, heading, relative, rotation_angle, wrap_angle
-from umf_ros.core.trajectory import Trajectory
+from umf_ros.core.geometry import Array, align, heading, make_pose, relative, rotation_angle, wrap_angle
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.families import FAMILIES
@@ -54,7 +64,8 @@ from umf_ros.lab.simulation.relief import Relief
 from umf_ros.lab.simulation.route import Walker
 from umf_ros.lab.simulation.simulator import Simulator, record
 from umf_ros.lab.simulation.world import TEST
-from umf_ros.localizer import Localizer, read_poses
+from umf_ros.localizer import Localizer
+from umf_ros.map_poses import MIN_SIGMAS, InitialPose, MapPoses, PoseHint
 from umf_ros.maps.joint_graph import JointMap, solve
 from umf_ros.maps.map_folder import MapFolder, MapSession
 from umf_ros.maps.mapping import Opening, add_session, grow, match_session, replay_session, unmatched
@@ -67,6 +78,8 @@ from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.sessions import OdometrySessionSplitter
 
 WITHIN_KEYFRAMES = 20
+CLOUD_STARTS = 10
+"""Cold starts of each visitor in an imported map."""
 WRONG_M, WRONG_DEG = 1.0, 5.0
 OVERLAP_M = 20.0
 Stream = list[Frame | OdometrySample | AbsoluteMeasurement]
@@ -189,10 +202,25 @@ def sees_again(poses: Array, known: Array, turn_rad: float = 0.0) -> Any:
     return (near & (turned <= np.radians(PLACE_ANGLE_DEG))).any(axis=1)
 
 
+class Starts(NamedTuple):
+    """Cold starts of a visitor: its stream, the rows where they begin, and what they need."""
+
+    stream: Stream
+    rows: list[int]
+    detector: LoopDetector
+    settings: Settings
+    map_T_world: Array
+    truth: Trajectory
+
+    def true(self, row: int) -> Array:
+        """The true pose in the map at a row."""
+        return np.asarray(self.map_T_world @ self.truth.at(np.array([self.stream[row].stamp_ns]))[0][0])
+
+
 def cold_starts(
     folder: MapFolder, joint: JointMap, truths: dict[str, Trajectory], visitor: Path, count: int, turn_rad: float
-) -> list[tuple[int | None, bool]]:
-    """Keyframes until each cold start knew its pose, None where it did not, and whether it was ever wrong.
+) -> Starts:
+    """The cold starts of a visitor.
 
     All begin where a session of the map drove in the direction of the visitor, turned by an angle.
     """
@@ -207,36 +235,96 @@ def cold_starts(
     usable = np.array(frames)[known & sees_again(poses, true, turn_rad)]
     rows = usable[np.linspace(0, max(len(usable) - 60, 0), count).astype(int)]
     detector = LoopDetector(settings, make_detector_embedder(settings))
-    return [wake(stream[row:], detector, settings, folder, map_T_world, truth) for row in rows]
+    return Starts(stream, rows.tolist(), detector, settings, map_T_world, truth)
 
 
-def wake(
-    stream: Stream, detector: LoopDetector, settings: Settings, folder: MapFolder, map_T_world: Array, truth: Trajectory
-) -> tuple[int | None, bool]:
-    """One cold start."""
+def wake(starts: Starts, row: int, initial: InitialPose | None = None) -> tuple[int | None, bool]:
+    """Keyframes until one cold start knew its pose, None where it did not, and whether it was ever wrong."""
+    detector, known = starts.detector, MapPoses(Path(starts.settings.map))
     detector.end_session()
-    localizer = Localizer(read_poses(folder.path), settings.pose_graph)
+    localizer = Localizer(known.places, starts.settings.pose_graph)
+    if initial is not None:
+        localizer.expect(initial)
+    detector.hint = None if initial is None else PoseHint(known.places, initial).near
     feed, keyframes, found, wrong = OdometrySessionSplitter(localizer), 0, None, False
-    for item in stream:
+    since_ns = starts.stream[row].stamp_ns - 10**9
+    before = [one for one in starts.stream[:row] if isinstance(one, OdometrySample) and one.stamp_ns > since_ns]
+    for item in before + starts.stream[row:]:
         if isinstance(item, OdometrySample):
             feed.take(item.stamp_ns, item.odom_T_body)
-            continue
-        assert isinstance(item, Frame)  # localising uses no absolute measurements
-        detection = detector.process(item)
-        keyframes += detection.keyframe is not None
-        for closure in detection.closures:
-            localizer.add_closure(closure)
+        else:
+            assert isinstance(item, Frame)  # localising uses no absolute measurements
+            detection = detector.process(item)
+            keyframes += detection.keyframe is not None
+            for closure in detection.closures:
+                localizer.add_closure(closure)
         estimate = localizer.estimate()
         if estimate is not None:
             found = keyframes if found is None else found
-            error = relative(map_T_world @ truth.at(np.array([estimate.stamp_ns]))[0][0], estimate.map_T_body)
+            true = starts.map_T_world @ starts.truth.at(np.array([estimate.stamp_ns]))[0][0]
+            error = relative(true, estimate.map_T_body)
             wrong |= bool(np.linalg.norm(error[:3, 3]) > WRONG_M or np.degrees(rotation_angle(error)) > WRONG_DEG)
         if keyframes >= WITHIN_KEYFRAMES:
             break
     return found, wrong
 
 
-def run_world(world: int, size: Size, work: Path, both_ways: bool) -> dict[str, Any]:
+def initial_poses(starts: Starts) -> dict[str, Any]:
+    """Keyframes until each start with an initial pose knew its pose, by the kind of that pose, and wrong ones."""
+    known, rng = MapPoses(Path(starts.settings.map)), np.random.default_rng(0)
+
+    def given(row: int, off_m: float, off_rad: float) -> InitialPose:
+        true, way = starts.true(row), rng.uniform(-np.pi, np.pi)
+        x_m, y_m = true[:2, 3] + off_m * np.array([np.cos(way), np.sin(way)])
+        return known.planar(x_m, y_m, float(heading(true)) + off_rad * float(rng.choice([-1.0, 1.0])))
+
+    def last(pose: Array) -> InitialPose | None:
+        with TemporaryDirectory() as folder:
+            known.write_last(Path(folder), InitialPose(pose, np.diag(MIN_SIGMAS**2) / 25))
+            return known.read_last(Path(folder))
+
+    def furthest(row: int) -> Array:
+        away = np.linalg.norm(known.places.poses[:, :3, 3] - starts.true(row)[:3, 3], axis=1)
+        return np.asarray(known.places.poses[int(away.argmax())])
+
+    rows, wrong, found = starts.rows, 0, dict[str, list[int | None]]()
+    kinds: dict[str, list[InitialPose | None]] = {
+        "none": [None for _ in rows],
+        "right": [given(row, 0.3, np.radians(5)) for row in rows],
+        "wrong by 5 m": [given(row, 5.0, 0.0) for row in rows],
+        "wrong by 200 m": [given(row, 200.0, 0.0) for row in rows],
+        "restart at the last pose": [last(starts.true(row)) for row in rows],
+        "kidnapped": [last(furthest(row)) for row in rows],
+    }
+    for kind, initial in kinds.items():
+        ends = [wake(starts, *one) for one in zip(rows, initial, strict=True)]
+        found[kind] = [keyframes for keyframes, _ in ends]
+        wrong += sum(is_wrong for _, is_wrong in ends)
+    return {"keyframes": found, "wrong": wrong}
+
+
+def in_cloud(folder: MapFolder, joint: JointMap, truths: dict[str, Trajectory], visitors: list[Path]) -> dict[str, Any]:
+    """Keyframes until cold starts in the map of a cloud knew their pose, by visitor, and wrong ones.
+
+    The first visitor drives in the direction of the sessions, the second against it.
+    """
+    out, found = folder.path.with_name("map_cloud"), dict[str, Any](wrong=0)
+    if not (out / "map.json").exists():
+        body_T_mast = make_pose(np.eye(3), [0.38, 0.0, 1.27])  # the LiDAR's place, with the axes of the body
+        poses = np.concatenate([one.poses @ body_T_mast for one in joint.sessions])
+        path = folder.path.with_name("poses.tum")
+        write_tum(path, Trajectory(np.arange(len(poses)) * 10**9, poses))
+        command = ["map", "import-cloud", folder.path / "map.ply", "--trajectory", path, "--fov", "70", "--out", out]
+        subprocess.run([sys.executable, "-m", "umf_ros.cli", *map(str, command)], check=True)
+    for visitor, turn_rad in zip(visitors, (0.0, np.pi), strict=True):
+        starts = cold_starts(MapFolder.open(out), joint, truths, visitor, CLOUD_STARTS, turn_rad)
+        ends = [wake(starts, row) for row in starts.rows]
+        found[visitor.stem] = [keyframes for keyframes, _ in ends]
+        found["wrong"] += sum(is_wrong for _, is_wrong in ends)
+    return found
+
+
+def run_world(world: int, size: Size, work: Path, both_ways: bool, what: str = "") -> dict[str, Any]:
     """All figures of one world."""
     work.mkdir(parents=True, exist_ok=True)
     numbers = range(1, size.sessions + 1)
@@ -244,8 +332,14 @@ def run_world(world: int, size: Size, work: Path, both_ways: bool) -> dict[str, 
     visitor = simulated(work, world, size.sessions + 1, size, both_ways)
     truths = {recording.stem: truth_of(recording) for recording in recordings}
     folder, joint, summary = mapped(work / "map", recordings)
+    if what == "cloud":
+        visitors = [simulated(work, world, size.sessions + 1, size, back) for back in (False, True)]
+        return {"world": world, **in_cloud(folder, joint, truths, visitors)}
     known = mapped(work / "map_one_way", recordings[::2])[:2] if both_ways else (folder, joint)
-    starts = cold_starts(*known, truths, visitor, size.starts, np.pi * both_ways)
+    visits = cold_starts(*known, truths, visitor, size.starts, np.pi * both_ways)
+    if what == "initial":
+        return {"world": world, **initial_poses(visits)}
+    starts = [wake(visits, row) for row in visits.rows]
     found = [keyframes for keyframes, _ in starts if keyframes is not None]
     return {
         "world": world,
@@ -331,6 +425,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="three sessions of 40 s, four cold starts")
     parser.add_argument("--both-ways", action="store_true", help="sessions in both directions, cold starts against it")
     parser.add_argument("--grow", action="store_true", help="a fourth session in a map that grew, or did not")
+    parser.add_argument("--what", choices=("", "initial", "cloud"), default="", help="cold starts with a difference")
     parser.add_argument("--lidar-only", action="store_true", help="without images")
     parser.add_argument("--seed", type=int, help="seed of a single world")
     parser.add_argument(
@@ -349,9 +444,10 @@ def main() -> None:
         return
     worlds = []
     for world in seeds(arguments.seed):
-        worlds.append(run_world(world, size, arguments.work / f"{kind}_{world}", arguments.both_ways))
+        folder = arguments.work / f"{kind}_{world}"
+        worlds.append(run_world(world, size, folder, arguments.both_ways, arguments.what))
         print(json.dumps(worlds[-1]), flush=True)
-    figures = summarise(worlds)
+    figures = {"worlds": worlds} if arguments.what else summarise(worlds)
     print(json.dumps({name: value for name, value in figures.items() if name != "worlds"}, indent=2))
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(figures, indent=2) + "\n")

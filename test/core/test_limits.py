@@ -22,7 +22,7 @@ import zstandard
 from umf_ros.core import limits
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.core.io import Schema, SqliteFile, read_yaml
-from umf_ros.localizer import POSES, read_poses
+from umf_ros.map_poses import POSES, read_poses
 from umf_ros.places.store import unpack
 from umf_ros.runs.run_file import read_table
 from umf_ros.sensors.decode import decode_picture

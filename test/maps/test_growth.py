@@ -19,7 +19,7 @@ from maps_made import COVARIANCE, MadeSession, made_map, on_circle, relative
 from umf_ros.core.config import Database, Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure
-from umf_ros.localizer import read_poses
+from umf_ros.map_poses import read_poses
 from umf_ros.maps.joint_graph import solve
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import grow, open_places

@@ -11,7 +11,7 @@ from maps_made import MadeSession, made_map, on_circle, tie
 from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.config import Settings
 from umf_ros.core.geometry import from_enu, make_pose, to_enu, transform
-from umf_ros.localizer import read_poses
+from umf_ros.map_poses import read_poses
 from umf_ros.maps.joint_graph import JointMap, solve
 from umf_ros.maps.outputs import sentence, write_results
 from umf_ros.pose_graph.closures import State

@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import relative
-from umf_ros.localizer import read_poses
+from umf_ros.map_poses import LAST_POSE, read_poses
 from umf_ros.maps.joint_graph import solve
 from umf_ros.maps.outputs import write_results
 from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, to_pose, to_time
@@ -109,6 +109,39 @@ def test_pose_and_transform_come_once_the_rover_is_found(rover: Rover, map_folde
     assert rover.until(lambda: rover.status["message"].startswith("not localised"))
     assert process.interrupt() == 0
     assert (tmp_path / "out" / "trajectory_in_map.tum").is_file()
+
+
+def test_a_click_in_rviz_and_the_last_pose_are_poses_with_one_closure(
+    rover: Rover, map_folder: Path, tmp_path: Path
+) -> None:
+    click = rover.create_publisher(PoseWithCovarianceStamped, "/initialpose", 1)
+    poses, stamp, out = read_poses(map_folder), LATER_NS + 10**12, f"results_dir:={tmp_path / 'out'}"
+    for is_restart in (False, True):
+        process = Process(MODULE, tmp_path / "node.log", "mode:=localization", f"map:={map_folder}", out)
+        process.wait_for("ready")
+        assert rover.until(lambda: rover.odometry.get_subscription_count() and click.get_subscription_count())
+        rover.poses.clear()
+        here = on_circle(np.array([30]))[0]
+        if not is_restart:
+            message = PoseWithCovarianceStamped()
+            message.pose.pose, message.header.frame_id = to_pose(here), "elsewhere"
+            click.publish(message)
+            assert rover.until(lambda: "set the fixed frame of rviz to 'map'" in process.output)  # noqa: B023
+            message.header.frame_id = "map"
+            click.publish(message)
+        for step in range(12):  # some centimetres are driven
+            stamp, now = stamp + STEP_NS, on_circle(np.array([30 + 0.03 * step]))[0]
+            rover.moved(stamp, relative(here, now))
+            wait_until(lambda: False, 0.1, lambda: rclpy.spin_once(rover, timeout_sec=0.02))
+            if step == 6:
+                assert not rover.poses  # a hint alone is no pose
+                closure = LoopClosure(stamp, int(poses.stamps_ns[30]), relative(here, now), COVARIANCE, 0.95)
+                rover.closures.publish(closure_to_message(closure))
+        assert rover.until(lambda: rover.poses)
+        found = decode_pose(rover.poses[-1].pose.pose)
+        assert np.linalg.norm(found[:3, 3] - poses.poses[30][:3, 3]) < 0.5
+        assert rover.until(lambda: (tmp_path / "out" / LAST_POSE).is_file())
+        process.kill()  # what is kept survives that
 
 
 def test_a_map_that_is_none_is_told_in_one_line(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ Pair = Annotated[
 ]
 
 
-COMMANDS = ("edit", "grow", "export")
+COMMANDS = ("edit", "grow", "export", "import-cloud")
 
 
 class _MakeOrChange(TyperGroup):
@@ -52,7 +52,8 @@ class _MakeOrChange(TyperGroup):
 
 ALSO = (
     "umf map edit decides about closures of a map by hand, umf map grow adds a drive that localised in it, "
-    "umf map export writes the map of the ground for other limits of a rover."
+    "umf map export writes the map of the ground for other limits of a rover, umf map import-cloud makes a map of the "
+    "cloud of another program."
 )
 app = typer.Typer(
     cls=_MakeOrChange,
@@ -191,6 +192,55 @@ def export(
     settings = (load_settings(config) if config else target.settings).terrain
     check_writable(folder)
     typer.echo(f"{folder}: {export_terrain(target, settings, folder)}")
+
+
+@app.command("import-cloud")
+def import_cloud(
+    cloud: Annotated[Path, typer.Argument(help="Cloud of a map, .pcd or .ply: metres, z upwards.")],
+    trajectory: Annotated[
+        Path | None, typer.Option(help="TUM file: poses of the LiDAR in the cloud; else where a rover can stand.")
+    ] = None,
+    out: MapPath = Path("map"),
+    config: options.ConfigPath = None,
+    fov: Annotated[float, typer.Option(min=20, max=360, help="Width that the LiDAR sees [deg].")] = 360.0,
+    low: Annotated[float, typer.Option(min=-89, max=0, help="Elevation of its lowest beam [deg].")] = -30.0,
+    high: Annotated[float, typer.Option(min=0, max=89, help="Elevation of its highest beam [deg].")] = 30.0,
+    height: Annotated[float, typer.Option(min=0.1, max=10, help="Its height above the ground [m].")] = 1.2,
+) -> None:
+    """Make a map of a point cloud of another program, to localise in with a LiDAR alone.
+
+    Places are views of the LiDAR rendered out of the cloud, along the trajectory in both directions, or every two
+    metres in four.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from umf_ros.bags.trajectories import read_tum
+    from umf_ros.core.config import load_settings
+    from umf_ros.detector import make_detector_embedder
+    from umf_ros.maps import cloud as clouds
+    from umf_ros.maps.joint_graph import solve
+    from umf_ros.maps.map_folder import MapFolder
+    from umf_ros.maps.outputs import write_results
+
+    options.check_files(cloud, config, trajectory)
+    if out.exists() and any(out.iterdir()):
+        raise ConfigError(f"{out} holds files already: import a cloud into a folder of its own; nothing was written")
+    console, settings = Console(), load_settings(config)
+    lidar = clouds.VirtualLidar(fov, low, high, height_m=height)
+    with Progress(console=console, transient=True) as bar:
+        bar.add_task("Reading the cloud", total=None)
+        points = clouds.read_cloud(cloud)
+        poses = clouds.along(read_tum(trajectory)) if trajectory else clouds.standing(points, height)
+        headings = (0.0, 180.0) if trajectory else (0.0, 90.0, 180.0, 270.0)
+        views, embedder = clouds.CloudViews(points, poses, headings, lidar), make_detector_embedder(settings)
+        target = MapFolder.open_or_create(out, settings)
+        task = bar.add_task("Rendering places", total=len(poses) * len(headings))
+        count = clouds.import_cloud(target, cloud, views, embedder, lambda: bar.advance(task))
+    console.print(f"{cloud}: {len(points)} points, {count} places", markup=False, highlight=False, soft_wrap=True)
+    with console.status("Solving the joint graph"):
+        summary = write_results(target, solve(target))
+    _print_summary(out, summary, console)
 
 
 def _new_recordings(target: MapFolder, bags: list[Bag], console: Console) -> dict[str, Path]:

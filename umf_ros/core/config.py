@@ -92,6 +92,14 @@ class Sync(Group):
     require_image: bool = Field(False, description="drop scans without an image, rather than use the scan alone")
 
 
+class OdometrySettings(Group):
+    """Odometry of a rover that has none."""
+
+    engine: Literal["", "vgicp"] = Field(
+        "", description="engine with which the front-end makes ~/odometry from the scans, for both nodes; empty: none"
+    )
+
+
 class KeyframePolicy(Group):
     """Selection of keyframes."""
 
@@ -198,6 +206,11 @@ class LocalizationSettings(Group):
     update: bool = Field(
         False, description="it becomes a session of the map at ~/save and at the end; needs a folder of results"
     )
+    initial_pose: str = Field(
+        "",
+        description="x and y (m) and heading (deg) in the map where the rover may start, verified like a closure; "
+        "empty: the last pose in results_dir, if there is one",
+    )
 
 
 class TerrainSettings(Group):
@@ -275,6 +288,7 @@ class Settings(Group):
     absolute: AbsoluteTopics = AbsoluteTopics()
     qos: Qos = Qos()
     sync: Sync = Sync()
+    odometry: OdometrySettings = OdometrySettings()
     keyframe: KeyframePolicy = KeyframePolicy()
     embedding: EmbeddingSettings = EmbeddingSettings()
     loop: Loop = Loop()

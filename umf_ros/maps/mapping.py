@@ -21,7 +21,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import rmtree
-from typing import Any
+from typing import Any, NamedTuple
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
@@ -299,26 +299,50 @@ def _new_places(target: MapFolder, run: Path) -> list[Keyframe]:
 
 
 def _add_run(target: MapFolder, run: Path, new: list[Keyframe]) -> MapSession:
-    """Write the run folder of a session from its places, and add these to the map."""
-    name, stamps = target.free_name(run), [one.stamp_ns for one in new]
-    folder = target.folder_of(name)
+    """Add what a rover saw in a run to the map, with the closures that it found there."""
+    stamps, odometry = [one.stamp_ns for one in new], list[OdometrySample]()
+    for one in new:
+        assert one.odom_T_body is not None
+        odometry.append(OdometrySample(one.stamp_ns, one.odom_T_body))
+    with closing(RunFile(run, read_only=True)) as file:
+        between = [one for one in file.closures() if one.query_stamp_ns in set(stamps)]
+    about = {"path": str(run.resolve()), "start_ns": min(stamps), "end_ns": max(stamps), "messages": {}}
+    drive = Drive(target.free_name(run), odometry, new, between)
+    return add_drive(target, drive, stored_identity(run / PLACES), about)
+
+
+class Drive(NamedTuple):
+    """A session that no recording is replayed for, on its own clock.
+
+    Attributes:
+        name: of the session.
+        odometry: of the drive.
+        places: along it.
+        between: closures with earlier places, whose matches are on the clock of the map.
+    """
+
+    name: str
+    odometry: list[OdometrySample]
+    places: list[Keyframe]
+    between: list[LoopClosure]
+
+
+def add_drive(target: MapFolder, drive: Drive, identity: tuple[str, int], about: dict[str, Any]) -> MapSession:
+    """Write the run folder of a drive, and add its places to the map; `identity` and `about` as in `add_places`."""
+    folder = target.folder_of(drive.name)
     with writing(folder):
         rmtree(folder, ignore_errors=True)  # of a process that was killed
         folder.mkdir(parents=True)
     with closing(RunFile(folder)) as file:
-        for one in new:
-            assert one.odom_T_body is not None
-            file.append_odometry(OdometrySample(one.stamp_ns, one.odom_T_body))
-    keyframes = [[one.stamp_ns, one.session, f"{one.path_length_m:.4f}"] for one in new]
+        for sample in drive.odometry:
+            file.append_odometry(sample)
+    keyframes = [[one.stamp_ns, one.session, f"{one.path_length_m:.4f}"] for one in drive.places]
     write_table(folder / "keyframes.csv", COLUMNS["keyframes"], keyframes)
     write_table(folder / "closures.csv", CLOSURES, [])
-    shift_ns, places = target.shift_for(min(stamps)), set(stamps)
-    with closing(RunFile(run, read_only=True)) as file:
-        between = [one for one in file.closures() if one.query_stamp_ns in places]
-    moved = [replace(one, query_stamp_ns=one.query_stamp_ns + shift_ns) for one in between]
+    shift_ns = target.shift_for(drive.odometry[0].stamp_ns)
+    moved = [replace(one, query_stamp_ns=one.query_stamp_ns + shift_ns) for one in drive.between]
     write_table(folder / BETWEEN, CLOSURES, [closure_row(one, float("nan")) for one in moved])
-    about = {"path": str(run.resolve()), "start_ns": min(stamps), "end_ns": max(stamps), "messages": {}}
-    return add_places(target, name, new, stored_identity(run / PLACES), about)
+    return add_places(target, drive.name, drive.places, identity, about)
 
 
 def _is_solved(target: MapFolder) -> bool:

@@ -21,7 +21,7 @@ from umf_ros.core.geometry import Array, evenly, first_of_cubes, invert, transfo
 from umf_ros.core.io import atomic_write, write_atomically, write_table
 from umf_ros.core.limits import read_json
 from umf_ros.core.trajectory import Trajectory, write_geojson, write_tum
-from umf_ros.localizer import POSES, read_poses
+from umf_ros.map_poses import POSES, read_poses
 from umf_ros.maps.joint_graph import JointMap, JointSession
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.places.database import PlaceDatabase

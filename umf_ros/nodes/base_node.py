@@ -15,6 +15,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -30,9 +31,10 @@ from umf_ros.core import watchdog
 from umf_ros.core.config import Settings, Topics, topics_of
 from umf_ros.core.errors import ConfigError, MessageError, OutputError, UmfError, either, shortened
 from umf_ros.core.io import check_writable
+from umf_ros.map_poses import InitialPose, MapPoses
 from umf_ros.nodes.conversions import from_time, latched, sensor_qos
 from umf_ros.nodes.diagnostics import WARN, InputWatch
-from umf_ros.nodes.parameters import changed_settings, declare
+from umf_ros.nodes.parameters import changed_settings, declare, with_own_odometry
 from umf_ros.nodes.process import Worker, interruptible, log_to
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import OdometrySample
@@ -75,6 +77,7 @@ class BaseNode(LifecycleNode, ABC):
         change_state = self._service_change_state.callback
         self._service_change_state.callback = partial(self._answer_transition, change_state)
         self._settings, self._results = declare(self, results)
+        self._settings = with_own_odometry(self._settings)
         self._input_names, self._finder = wanted, None
         if must_find(self._settings, wanted):
             self._check_results()  # before it waits for topics
@@ -447,3 +450,23 @@ class BaseNode(LifecycleNode, ABC):
             self._settings = settings
             if self._opened:
                 self._retune(settings)
+
+
+def follow_initial_pose(node: BaseNode, take: Callable[[MapPoses, InitialPose], None]) -> MapPoses | None:
+    """Pass on the pose where the rover may be: of the parameter or the last run now, of rviz whenever it comes.
+
+    Returns:
+        The poses of the map; None while mapping.
+    """
+    settings = node._settings
+    if not settings.localizing:
+        return None
+    known = MapPoses(Path(settings.map))
+    if (initial := known.initial(settings, node._results)) is not None:
+        take(known, initial)
+
+    def receive(message: PoseWithCovarianceStamped) -> None:
+        take(known, known.from_message(message, settings.frames.map))
+
+    node.create_subscription(PoseWithCovarianceStamped, "initialpose", node._guarded("initial pose", receive), 1)
+    return known

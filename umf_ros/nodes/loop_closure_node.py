@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -30,11 +30,13 @@ from umf_ros.core.frames import Frame, Keyframe, LoopClosure, State
 from umf_ros.core.geometry import Array, rotation_angle
 from umf_ros.core.io import memory_mb
 from umf_ros.detector import WITHHELD, Detection, LoopDetector, make_detector_embedder
+from umf_ros.map_poses import InitialPose, MapPoses, PoseHint
 from umf_ros.nodes import conversions as messages
-from umf_ros.nodes.base_node import BaseNode
+from umf_ros.nodes.base_node import BaseNode, follow_initial_pose
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, MAX_LINES, SCAN_FIELDS
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
+from umf_ros.nodes.scan_odometry import LOST, SCANS, start_engine
 from umf_ros.runs.run_file import as_stored
 from umf_ros.runs.writer import RunRecorder, count_drops, with_places
 from umf_ros.sensors.calibration import calibration_of
@@ -51,6 +53,8 @@ DECODE_S = 0.5
 """Longest time at the end for waiting messages, and as long again for the one in hand."""
 RESUME = "played again into a node with the same results_dir and database.path, they continue the run"
 SCAN_DEPTH = 50
+MAX_LOST = 0.05
+"""Share of scans that may not fit the motion before them, as in a replay."""
 MESSAGE_TYPES = {"cloud": PointCloud2, "odometry": Odometry}
 MESSAGE_TYPES |= dict.fromkeys(("left_image", "right_image"), Image)
 MESSAGE_TYPES |= dict.fromkeys(("left_info", "right_info"), CameraInfo)
@@ -87,11 +91,18 @@ class LoopClosureNode(BaseNode):
         self._lock = threading.Lock()
         self._paused = self._ends_session = False
         self._wanted: Settings | None = None
+        self._hint: Callable[[Keyframe], dict[int, Array]] | None = None
+        follow_initial_pose(self, self._expect)
         self._closures = self._between = 0
         self._last: Detection | None = None
         self._worker: Worker[Frame] = Worker(self._detect, self._report_fault, settings.worker.queue_size)
         self._writer: Worker[None] = Worker(lambda _: self._write_summary(), self._report_fault, 1)
         self._decoder: Worker[tuple[str, Any]] = Worker(self._take, self._report_fault, INTAKE_QUEUE)
+        self._engine: Worker[Any] | None = None
+        self._engine_counts = Counter[str]()
+        if settings.odometry.engine:
+            rig = calibration, self._body_frames
+            self._engine, self._engine_counts = start_engine(self, settings, *rig, self._report_fault)
         for name, topic in topics.model_dump().items():
             if topic:
                 take = partial(self._enqueue, topic)
@@ -106,6 +117,8 @@ class LoopClosureNode(BaseNode):
         """Finish the frames that wait, as far as there is time, and write the results."""
         self._saver.close(timeout_s=watchdog.PATIENT_S)
         last, dropped = self._last, self._worker.dropped + self._decoder.dropped
+        if self._engine is not None:
+            self._engine.close(timeout_s=DECODE_S)
         self._decoder.close(timeout_s=DECODE_S)
         for frame in self._synchronizer.flush():
             self._worker.submit(frame)
@@ -140,8 +153,15 @@ class LoopClosureNode(BaseNode):
         self._wanted = settings  # the executor must not wait for the current keyframe
 
     def _enqueue(self, topic: str, message: Any) -> None:
+        if self._engine is not None and topic == topics_of(self._settings).cloud:
+            self._engine.submit(message)
         if not self._paused:
             self._decoder.submit((topic, message))
+
+    def _expect(self, known: MapPoses, initial: InitialPose) -> None:
+        """Verify an initial pose with the next keyframes."""
+        self.get_logger().info(f"initial pose {initial}: verified like a closure, and searched if it is wrong")
+        self._hint = PoseHint(known.places, initial).near
 
     def _take(self, item: tuple[str, Any]) -> None:
         self._router.take(*item)
@@ -153,6 +173,8 @@ class LoopClosureNode(BaseNode):
             wanted, self._wanted = self._wanted, None
             if wanted is not None:
                 self._detector.retune(wanted)
+            if self._hint is not None:
+                self._detector.hint, self._hint = self._hint, None
             if self._ends_session:
                 self._ends_session = False
                 self._detector.end_session()
@@ -204,6 +226,7 @@ class LoopClosureNode(BaseNode):
             **{f"fault_{kind}": count for kind, count in self._faults.items()},
             **{f"dropped_{name}": count for name, count in self._drops().items()},
             **_counts(self._synchronizer),
+            **self._engine_counts,
             **self._fleet(),
         }
         level, text = OK, f"{self._closures} closures among {len(self._detector.database)} places"
@@ -213,6 +236,9 @@ class LoopClosureNode(BaseNode):
             level = ERROR
         elif self._detector.sensors.contradictions:
             level, text = ERROR, f"{WITHHELD}: {self._detector.sensors.contradictions[0].what}"
+        elif self._engine_counts[LOST] > max(1, MAX_LOST * self._engine_counts[SCANS]):
+            lost = f"{self._engine_counts[LOST]} of {self._engine_counts[SCANS]} scans"
+            level, text = WARN, f"{self._settings.odometry.engine} lost track of {lost}: it sees too little of its way"
         elif self._worker.dropped or self._decoder.dropped:
             level, text = WARN, "too slow: messages are being dropped"
         return status(level, "detector", text, values)

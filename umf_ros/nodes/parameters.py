@@ -20,6 +20,7 @@ from umf_ros.core.errors import ConfigError
 BUILT_IN = ("use_sim_time", "qos_overrides", "start_type_description_service")
 AUTOSTART = "configure and activate at once; false: wait for the services of the life cycle"
 SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
+MADE_ODOMETRY = "loop_closure_node/odometry"
 CHANGEABLE = (
     "loop.",
     "verification.min_probability",
@@ -77,6 +78,20 @@ def changed_settings(settings: Settings, parameters: Sequence[Parameter]) -> Set
         return settings
     values = {name: value for name, _, value in _leaves(settings)}
     return parse_settings(nest(values | changed))
+
+
+def with_own_odometry(settings: Settings) -> Settings:
+    """Return settings whose topic of the odometry is that of the front-end, where an engine makes it.
+
+    Raises:
+        ConfigError: they name a topic of the odometry, too.
+    """
+    if not settings.odometry.engine:
+        return settings
+    if settings.topics.odometry and "odometry" in settings.topics.model_fields_set:
+        raise ConfigError("odometry.engine makes the odometry that topics.odometry names: leave one of them")
+    topics = settings.topics.model_copy(update={"odometry": MADE_ODOMETRY})
+    return settings.model_copy(update={"topics": topics})
 
 
 def describe(name: str, field: FieldInfo) -> ParameterDescriptor:

@@ -11,6 +11,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from diagnostic_msgs.srv import AddDiagnostics
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
@@ -28,8 +29,9 @@ from umf_ros.core.config import Settings
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.graph_process import JOURNAL, ProcessEndedError, start_graph
+from umf_ros.map_poses import InitialPose, MapPoses
 from umf_ros.nodes import conversions as messages
-from umf_ros.nodes.base_node import ODOMETRY_DEPTH, BaseNode
+from umf_ros.nodes.base_node import ODOMETRY_DEPTH, BaseNode, follow_initial_pose
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, parse_pair
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
@@ -55,6 +57,8 @@ LEFT, DROPPED = "the next start with this folder processes them", "without resul
 UNSETTLED = "no time to settle the graph: its current results were written; the next start with this folder settles it"
 DRAWING = 20.0
 """Least pause between publications of path and markers, as a multiple of their duration: long paths are large."""
+KEPT_M = 0.1
+"""Least motion until the pose is kept again for the next start."""
 GRACE_S = 0.5
 """Time within which a front-end that shuts down with this node reports it."""
 
@@ -88,6 +92,9 @@ class PoseGraphNode(BaseNode):
             self.get_logger().info(recovery)
             self._announce(self._durable.closures())
         self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._on_failure, AT_ONCE)
+        self._newest: OdometrySample | None = None
+        self._kept_at = np.full(3, np.inf)
+        self._map_poses = follow_initial_pose(self, self._expect)
         if self._state.unsettled:
             self._worker.submit(self._settle_previous, needed=True)
         is_aided = bool(settings.absolute.gnss or settings.absolute.imu)
@@ -166,6 +173,19 @@ class PoseGraphNode(BaseNode):
         if measurement is not None:
             self._submit(measurement)
 
+    def _expect(self, _: MapPoses, initial: InitialPose) -> None:
+        self._worker.submit(lambda: self._durable.expect(initial), needed=True)
+
+    def _keep_pose(self) -> None:
+        """Keep a pose that has moved for the next start."""
+        newest, map_T_odom = self._newest, self._state.map_T_odom
+        if self._map_poses is None or not self._results or map_T_odom is None or newest is None:
+            return
+        pose = map_T_odom @ newest.odom_T_body
+        if np.linalg.norm(pose[:3, 3] - self._kept_at) > KEPT_M:
+            self._map_poses.write_last(Path(self._results), InitialPose(pose, self._state.covariance))
+            self._kept_at = pose[:3, 3]
+
     def _make_publishers(self) -> None:
         self._path_publisher = self.create_publisher(PathMessage, "~/path", LATCHED_QOS)
         self._pose_publisher = self.create_publisher(PoseWithCovarianceStamped, "~/pose", 50)
@@ -185,6 +205,7 @@ class PoseGraphNode(BaseNode):
         map_T_odom = state.map_T_odom
         if map_T_odom is None or self._corrected != session or not decided or decided[-1].fault:
             return
+        self._newest = sample
         pose = messages.pose(sample.stamp_ns, map_T_odom @ sample.odom_T_body, state.covariance, self._frames)
         self._pose_publisher.publish(pose)
         transform = messages.transform(sample.stamp_ns, map_T_odom, self._frames)
@@ -280,6 +301,7 @@ class PoseGraphNode(BaseNode):
             self._durable.prepare(PREPARE_S)
         self._correct()
         self._show()
+        self._keep_pose()
 
     def _own_status(self) -> DiagnosticStatus:
         state = self._state

@@ -21,7 +21,7 @@ from umf_ros.core.io import write_atomically
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.findings import RunVerdict, conclude, judge, look_first
 from umf_ros.runs.reader import FinishedRun
-from umf_ros.runs.run_file import read_inliers
+from umf_ros.runs.run_file import NAME, read_inliers
 from umf_ros.runs.scene import (
     build_scene,
     by_need,
@@ -30,6 +30,7 @@ from umf_ros.runs.scene import (
     read_pictures,
     size_of,
 )
+from umf_ros.runs.self_check import TABLE, check_run
 from umf_ros.runs.truth import MEDIAN_EXPECTED, JudgedRun, in_words
 from umf_ros.sensors.sensor_check import SensorReport
 
@@ -143,6 +144,8 @@ def _facts(summary: Summary) -> list[tuple[str, str]]:
         medians = {stage: times["p50"] for stage, times in latency.items() if stage != "total"}
         stages = ", ".join(f"{stage} {median:.0f}" for stage, median in medians.items() if median is not None)
         facts["latency"] = f"{latency['total']['p50']:.0f} ms per keyframe, median ({stages})"
+    if told := summary.get("self_check"):
+        facts["self-check"] = told
     facts["dropped"] = ", ".join(f"{name} {count}" for name, count in summary["drops"].items())
     facts["memory"] = f"{summary['peak_rss_mb']:.0f} MB at most"
     return list(facts.items())
@@ -188,6 +191,7 @@ def finish_run(
         printed: lines that were printed before the run, and are not repeated.
     """
     with console.status("Judging and writing the report"):
+        run.summary["self_check"] = _judged_by_itself(run)
         about = replace(judge(run, bag), sensors=sensors)
         inliers = read_inliers(run.folder / "inliers.csv")
         pairs = pairs_of(about)
@@ -198,3 +202,12 @@ def finish_run(
         write_page(about, verdict, findings, build_scene(about, pairs, pictures, inliers, heights))
     print_summary(console, about, verdict, findings, printed)
     return verdict
+
+
+def _judged_by_itself(run: FinishedRun) -> str | None:
+    """Return what the run says of its own closures, and write the table; None of a run without any."""
+    if not run.closures or not (run.folder / NAME).is_file():
+        return None
+    found = check_run(run.folder)
+    found.write(run.folder / TABLE)
+    return found.sentence

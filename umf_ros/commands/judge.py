@@ -1,0 +1,22 @@
+"""`umf judge`: closures of a run judged by the run itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(folder: Annotated[Path, typer.Argument(help="A run folder, such as results/latest.")]) -> None:
+    """Judge the closures of a run without ground truth, by loops, independent closures and the overlap of local maps.
+
+    Prints their precision with an interval of 95 %, and the closures it doubts; writes self_check.csv into the folder.
+    """
+    from umf_ros.runs.self_check import TABLE, check_run
+
+    found = check_run(folder)
+    found.write(folder / TABLE)
+    for row in found.doubted:
+        typer.echo(f"doubted: {found.describe(row)}")
+    typer.echo(f"{folder}: {found.sentence}")
