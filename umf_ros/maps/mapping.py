@@ -31,7 +31,7 @@ from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
 from umf_ros.bags.trajectories import read_odometry
-from umf_ros.core.config import Database, Settings, Verification
+from umf_ros.core.config import Database, ParameterSource, Settings, Verification
 from umf_ros.core.errors import BagError, UmfError, writing
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.core.io import lock_file, write_table
@@ -72,7 +72,7 @@ class Opening:
         odometry_frame: frame whose poses the files hold.
     """
 
-    config: Path | None = None
+    config: ParameterSource = None
     dataset: str = "auto"
     embedder: str | None = None
     weights: str | None = None
