@@ -46,7 +46,7 @@ def command(
     console, source = Console(), parameters(config, changes)
     with waiting(console, "Reading the recording"):
         recording = open_bag(bag)
-        found = inspect(recording, source)
+        found = inspect(recording, source, for_file=write is not None)
     if write is not None:
         config, changes = _write(console, found, recording, write), None
         with waiting(console, "Reading the recording"):
@@ -111,6 +111,6 @@ def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> 
     write_atomically(calibration, text)
     write_atomically(settings, write_settings(found, str(calibration.resolve())))
     guesses = text.count(GUESS)
-    then = f"; {guesses} entries of the calibration are guesses: measure them" if guesses else ""
+    then = f"; entries of the calibration that are guesses, to be measured: {guesses}" if guesses else ""
     console.print(f"wrote {settings} and {calibration}{then}", **PLAIN)
     return settings

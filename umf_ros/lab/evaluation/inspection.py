@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -69,13 +69,19 @@ class Inspected:
         return next((one.what for one in self.advice if one.severity == "fault"), "")
 
 
-def inspect(bag: Bag, source: ParameterSource = None) -> Inspected:
+def inspect(bag: Bag, source: ParameterSource = None, for_file: bool = False) -> Inspected:
     """Look at a recording as a replay with these parameters would: its topics, their messages, and the first frames.
+
+    `for_file` takes topics by their type also where the recording lacks those of its data set, to write them.
 
     Raises:
         ConfigError: the parameters are wrong.
     """
     found = _settings_of(bag, source)
+    if for_file:
+        by_type = find_topics(bag.types)[0].model_dump().items()
+        lacking = {name: topic for name, topic in by_type if not getattr(found.topics, name)}
+        found.topics = found.topics.model_copy(update=lacking)
     for name, fits in found.ambiguous.items():
         command = command_line("inspect", bag.path, "--set", f"topics.{name}={fits[0]}")
         found.advice.append(Advice("fault", f"several topics fit {name}: {either(fits)}", f"name one: {command}"))
@@ -187,9 +193,9 @@ def _about_frames(bag: Bag, found: Inspected) -> Iterator[Advice]:
         yield Advice("fault", str(error))
         return
     yield from (Advice("warning", text) for text in told if text != bag.warning)
-    yield from useless_inputs(input_counts(reader.counters))
-    if not any(frame.left is not None or frame.points is not None for frame in frames):
-        yield Advice("fault", "none of the first messages makes a frame")
+    has_depth = any(one.points is not None or (one.left is not None and one.right is not None) for one in frames)
+    for one in useless_inputs(input_counts(reader.counters)):
+        yield replace(one, severity="warning") if has_depth else one
 
 
 def _about_odometry(bag: Bag, found: Inspected) -> Iterator[Advice]:
