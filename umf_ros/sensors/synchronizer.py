@@ -169,7 +169,7 @@ class Synchronizer:
             MessageError: of kind "size" when the calibration is for other images.
         """
         if (sensor := _SENSORS.get(name)) in self._calibration.lacks:
-            raise MessageError("transforms", f"the calibration has no body_T_{sensor}")
+            raise MessageError("transforms", f"the calibration has no body_T_{sensor}: add it, or leave out the topic")
         if name in ("left", "right") and self._window is not None:
             self._calibration = self._calibration.within(self._window, value.shape[::-1])
         expected = self._calibration.image_size
