@@ -168,5 +168,5 @@ def test_changes_by_text_are_like_those_in_the_file(tmp_path: Path) -> None:
 def test_what_was_meant_and_where_it_is_wrong_are_named(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=".*".join(map(re.escape, message.split("...")))):
         load_settings(write(tmp_path / "a.yaml", text))
-    with pytest.raises(ConfigError, match="^unknown parameter loop.topk; did"):  # not the file's fault
+    with pytest.raises(ConfigError, match=r"^unknown parameter loop\.topk; did"):  # not the file's fault
         load_settings(write(tmp_path / "a.yaml", "loop.top_k: 7"), loop__topk=3)
