@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from functools import cache
 from importlib import import_module
 from inspect import getdoc
+from itertools import pairwise
 from typing import Annotated, NoReturn
+
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during the imports: no traceback
 
 import typer
 
@@ -23,6 +28,7 @@ COMMANDS = {
     "import": "umf_ros.lab.commands.import_data",
     "inspect": "umf_ros.lab.commands.inspect",
     "replay": "umf_ros.commands.replay",
+    "config": "umf_ros.commands.recordings:show_parameters",
     "slam": "umf_ros.commands.slam",
     "map": "umf_ros.commands.map:app",
     "judge": "umf_ros.commands.judge",
@@ -104,6 +110,12 @@ def main() -> NoReturn:
     SIGTERM ends with 143 after a clean-up: unfinished files are removed, nodes are ended.
     """
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    for before, word in pairwise(sys.argv):
+        if re.fullmatch(r"-\d[\d.]*", word) and not before.startswith("-"):
+            typer.echo(f"umf: {word} is before the start, and no option", err=True)
+            sys.exit(2)
     try:
         for word in sys.argv:
             check_utf8(word, UmfError)

@@ -1,12 +1,13 @@
 from __future__ import annotations
 
+import re
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import yaml
 
-from umf_ros.core.config import Settings, dump_settings, load_settings, nest
+from umf_ros.core.config import Parameters, Settings, dump_settings, load_settings, nest, parse_changes
 from umf_ros.core.errors import ConfigError
 
 
@@ -129,3 +130,43 @@ def test_a_file_without_end_or_with_a_name_without_end_is_one_short_line(tmp_pat
         with pytest.raises(ConfigError) as caught:
             load_settings(path)
         assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+def test_paths_in_a_file_are_relative_to_it_and_those_of_overrides_to_the_folder_one_is_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "config").mkdir()
+    path = write(tmp_path / "config" / "a.yaml", "calibration: own.yaml\nembedding.weights: ../net.safetensors\n")
+    monkeypatch.chdir(tmp_path)
+    found = load_settings("config/a.yaml", map="maps/one")
+    assert Path(found.calibration) == path.parent / "own.yaml" and Path(found.map) == tmp_path / "maps" / "one"
+    assert Path(found.embedding.weights).resolve() == tmp_path / "net.safetensors"
+    assert load_settings(write(path, "calibration: tf\n")).calibration == "tf"
+    assert load_settings(write(path, "calibration: s3li-etna\n")).calibration == "s3li-etna"
+
+
+def test_changes_by_text_are_like_those_in_the_file(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.yaml", "loop: {top_k: 7}\ndataset: auto\n")
+    changes = parse_changes(["loop.min_travel_m=2.5", "topics.left_image=", "qos.reliability=reliable"])
+    found = load_settings(Parameters(path, changes), loop__top_k=None)
+    assert (found.loop.top_k, found.loop.min_travel_m, found.topics.left_image) == (7, 2.5, "")
+    assert found.qos.reliability == "reliable" and "dataset" not in found.model_fields_set
+    for text in ("loop.top_k", "=3"):
+        with pytest.raises(ConfigError, match=f"--set {text}: expected NAME=VALUE"):
+            parse_changes([text])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("loop: {topk: 7}", "a.yaml: unknown parameter loop.topk; did you mean loop.top_k?"),
+        ("top_k: 7", "did you mean loop.top_k?"),
+        ("", "a.yaml is empty"),
+        ("loop:\n  {top_k: 7", "not valid YAML: line 3, column "),
+    ],
+)
+def test_what_was_meant_and_where_it_is_wrong_are_named(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=".*".join(map(re.escape, message.split("...")))):
+        load_settings(write(tmp_path / "a.yaml", text))
+    with pytest.raises(ConfigError, match=r"^unknown parameter loop\.topk; did"):  # not the file's fault
+        load_settings(write(tmp_path / "a.yaml", "loop.top_k: 7"), loop__topk=3)

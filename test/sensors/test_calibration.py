@@ -6,8 +6,11 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from recordings import CALIBRATION, camera_info
+from recordings import CALIBRATION, camera_info, traverse, write_mcap
 
+from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.reader import open_bag
+from umf_ros.core.config import load_settings
 from umf_ros.core.errors import CalibrationError
 from umf_ros.core.geometry import make_pose, transform
 from umf_ros.sensors.calibration import RawCamera, SensorWindow, StereoRectifier, load_calibration
@@ -221,3 +224,25 @@ def test_lenses_that_are_none_are_named(lens: dict[str, object], text: str, tmp_
     with pytest.raises(CalibrationError, match=text) as caught:
         load_calibration(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("without", "lacks"), [(("camera", "body_T_camera"), "camera"), (("body_T_lidar",), "lidar")])
+def test_a_rover_without_a_sensor_leaves_out_its_entries(tmp_path: Path, without: tuple[str, ...], lacks: str) -> None:
+    content = {name: value for name, value in yaml.safe_load(CALIBRATION).items() if name not in without}
+    path = tmp_path / "calibration.yaml"
+    path.write_text(yaml.safe_dump(content))
+    found = load_calibration(path)
+    assert found.lacks == (lacks,)
+    bag = open_bag(write_mcap(tmp_path / "bag.mcap", traverse(1.0)))
+    told: list[str] = []
+    frames = list(FrameReader(bag, load_settings(None, calibration=str(path)), warn=told.append))
+    assert any(f"the calibration has no body_T_{lacks}" in line for line in told)
+    assert all((frame.left if lacks == "camera" else frame.points) is None for frame in frames)
+
+
+def test_a_calibration_of_no_sensor_or_of_half_a_camera_is_refused(tmp_path: Path) -> None:
+    content, path = yaml.safe_load(CALIBRATION), tmp_path / "calibration.yaml"
+    for without in (("camera", "body_T_camera", "body_T_lidar"), ("body_T_camera",), ("camera",)):
+        path.write_text(yaml.safe_dump({name: value for name, value in content.items() if name not in without}))
+        with pytest.raises(CalibrationError, match="expected body_T_"):
+            load_calibration(path)

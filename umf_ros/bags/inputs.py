@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from umf_ros.bags.reader import Bag
-from umf_ros.core.config import Settings, topics_of
+from umf_ros.core.config import Settings, Topics, topics_of
+from umf_ros.core.errors import command_line, either
 from umf_ros.sensors.decode import TYPES
 from umf_ros.sensors.sessions import Input
 from umf_ros.sensors.synchronizer import InputCounter
@@ -24,7 +25,6 @@ _ABSENT: dict[str, tuple[Severity, str]] = {
 _NAMES: dict[str, str] = {"left": "left images", "right": "right images", "cloud": "scans", "odometry": "odometry"}
 _HELP = {
     "size": "the calibration is for images of another size: width, height, fx, fy, cx, cy",
-    "encoding": "umf inspect lists the supported encodings",
     "fields": "the cloud needs fields x, y and z",
     "stamp": "the driver must set header.stamp",
     "pose": "the odometry must send unit quaternions",
@@ -59,30 +59,48 @@ class Advice:
         return f"{self.what}; {self.remedy}" if self.remedy else self.what
 
 
+def present_topics(bag: Bag, settings: Settings) -> Topics:
+    """Return the topics of the settings that the recording has, the others empty."""
+    topics = topics_of(settings)
+    counts = {name: bag.topics[topic].count for name, topic in topics.model_dump().items() if topic in bag.topics}
+    return topics.model_copy(update=dict.fromkeys([name for name in topics.model_dump() if not counts.get(name)], ""))
+
+
 def absent_inputs(bag: Bag, settings: Settings, odometry_from_file: bool = False) -> list[Advice]:
-    """Return inputs that the settings name and the recording lacks."""
-    topics = topics_of(settings).model_dump()
-    absent = [name for name in _ABSENT if not (topics[name] in bag.topics and bag.topics[topics[name]].count)]
+    """Return inputs that the settings name and the recording lacks, first whether there is any depth."""
+    topics, present = topics_of(settings).model_dump(), present_topics(bag, settings)
     found: list[Advice] = []
-    for name in absent:
-        severity, text = _ABSENT[name]
-        if name == "cloud" and topics["right_image"] and "right_image" in absent:
-            severity = "fault"  # neither a scan nor a second image: no depth at all
+    if present.left_image and not present.cloud and not present.right_image:
+        what = "no depth: one camera, no scans and no right images; places are recognised, but no closure is metric"
+        helps = [name for name in ("cloud", "right_image") if _others(name, bag, present)]
+        remedies = [_remedy(name, bag, present) for name in helps]
+        found.append(Advice("fault", what, either(remedies) or "record scans or a stereo pair"))
+    for name, (severity, text) in _ABSENT.items():
+        if getattr(present, name):
+            continue
         if topics[name] and not (name == "odometry" and odometry_from_file):
-            found.append(Advice(severity, text.format(topics[name]), _remedy(name, bag)))
+            found.append(Advice(severity, text.format(topics[name]), _remedy(name, bag, present)))
         elif name == "odometry" and not odometry_from_file:
-            found.append(Advice("note", text.replace(" on {}", ""), _remedy(name, bag)))
+            found.append(Advice("note", text.replace(" on {}", ""), _remedy(name, bag, present)))
     return found
 
 
-def _remedy(name: str, bag: Bag) -> str:
-    others = sorted(topic for topic, info in bag.topics.items() if info.type in TYPES[name] and info.count)
+def _others(name: str, bag: Bag, present: Topics) -> list[str]:
+    """Return topics of the type of an input that no input has."""
+    used = set(present.model_dump().values())
+    return sorted(
+        one for one, info in bag.topics.items() if info.type in TYPES[name] and info.count and one not in used
+    )
+
+
+def _remedy(name: str, bag: Bag, present: Topics) -> str:
+    others = _others(name, bag, present)
     if name == "odometry":
         supplied = "--odometry FILE.tum supplies it, or vgicp on scans"
-        return f"set topics.odometry ({', '.join(others)})" if others else supplied
+        return f"--set topics.odometry={others[0]}" if others else supplied
     if not others:
-        return f"the recording has no {TYPES[name][0]} at all"
-    return f"set topics.{name} in a --config ({', '.join(others)})"
+        return f"the recording has no other {TYPES[name][0]}"
+    return f"--set topics.{name}={others[0]}" + (f" (or {either(others[1:])})" if others[1:] else "")
 
 
 def input_counts(counters: Mapping[Input, InputCounter]) -> dict[str, Any]:
@@ -93,8 +111,8 @@ def input_counts(counters: Mapping[Input, InputCounter]) -> dict[str, Any]:
     }
 
 
-def useless_inputs(inputs: Mapping[str, Any]) -> list[Advice]:
-    """Return inputs of which all or many messages could not be used."""
+def useless_inputs(inputs: Mapping[str, Any], bag: object = None) -> list[Advice]:
+    """Return inputs of which all or many messages could not be used; `bag` is the path of the recording, if known."""
     found = []
     for name, count in inputs.items():
         lost = Counter({reason: number for reason, number in count["dropped"].items() if reason != "surplus"})
@@ -102,7 +120,8 @@ def useless_inputs(inputs: Mapping[str, Any]) -> list[Advice]:
             continue
         reasons = ", ".join(f"{reason} {number}" for reason, number in lost.most_common())
         messages = f"{lost.total()} of {count['received']} messages of the {_NAMES.get(name, name)}"
-        remedy = _HELP.get(lost.most_common(1)[0][0], "run umf inspect for details")
+        details = "" if bag is None else f"details: {command_line('inspect', bag)}"
+        remedy = _HELP.get(lost.most_common(1)[0][0], details)
         what = f"{messages} could not be used ({reasons})"
         found.append(Advice("warning" if count["used"] else "fault", what, remedy))
     return found

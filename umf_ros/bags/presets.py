@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from contextlib import suppress
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 from umf_ros.bags.reader import Bag, decode
-from umf_ros.core.config import Settings, load_preset, load_settings
+from umf_ros.core.config import ParameterSource, Settings, load_preset, load_settings
 from umf_ros.core.errors import BagError, MessageError
 from umf_ros.sensors.calibration import load_calibration
 from umf_ros.sensors.tf import MOVING_TOPIC, transform_topics
@@ -55,7 +54,7 @@ def _contradiction(bag: Bag, name: str) -> str:
     return f"the recording has topics of {name}, but {' or '.join(sorted(infos))} is for images of {found}"
 
 
-def settings_for(bag: Bag, config: Path | None, dataset: str, **overrides: Any) -> Settings:
+def settings_for(bag: Bag, config: ParameterSource, dataset: str, **overrides: Any) -> Settings:
     """Return settings to read a recording with: those of a parameter file and overrides as in `load_settings`.
 
     A data set that is named goes before that of the file; "auto" takes it from the file, or from the recording's

@@ -130,7 +130,11 @@ def read_odometry(path: str | Path, frame: str, settings: Settings) -> Trajector
     mountings = {"body": np.eye(4), **mountings}
     if frame not in mountings:
         raise BagError(f"unknown frame {frame!r} of the odometry; expected one of {', '.join(mountings)}")
+    if frame in calibration.lacks:
+        raise BagError(f"the odometry is of the {frame}, and the calibration has no body_T_{frame}")
     found = read_tum(path)
+    if len(found) < 2:
+        raise BagError(f"{path} holds a single pose, which is no odometry")
     sizes_m = np.linalg.svd(found.poses[:, :3, 3] - found.poses[:, :3, 3].mean(axis=0), compute_uv=False)
     if not found.has_orientation and sizes_m[1:].max(initial=0) > CURVED * sizes_m[0]:
         raise BagError(f"{path} has no rotations (none, or the same in every line): odometry needs them")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
+from threading import Event, Thread
 from types import FrameType
 from typing import Any
 
@@ -19,14 +21,55 @@ WARNING: dict[str, Any] = {"style": "yellow", "markup": False, "highlight": Fals
 """Options for printing a warning: file names keep their brackets, lines are not wrapped."""
 
 
-class FrameProgress(Progress):
+EVERY_S = 10.0
+"""Time between two lines of progress where the output is no terminal."""
+
+
+@contextmanager
+def waiting(console: Console, what: str) -> Iterator[None]:
+    """Show what is being done on a terminal; elsewhere print a line about it every ten seconds."""
+    if console.is_terminal:
+        with console.status(what):
+            yield
+        return
+    done, start_s = Event(), time.monotonic()
+
+    def tell() -> None:
+        while not done.wait(EVERY_S):
+            console.print(f"{what}: {time.monotonic() - start_s:.0f} s", markup=False, highlight=False)
+
+    teller = Thread(target=tell, name="progress", daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        done.set()
+        teller.join()
+
+
+class LineProgress(Progress):
+    """Progress of one task on a terminal; elsewhere a line every ten seconds."""
+
+    def __init__(self, console: Console, what: str) -> None:
+        columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[found]}")
+        super().__init__(*columns, TimeRemainingColumn(), console=console, transient=True)
+        self._task = self.add_task(what, total=1.0, found="")
+        self._what, self._told_s = what, time.monotonic()
+
+    def advance_to(self, done: float, found: str = "") -> None:
+        """Show a share of the task, 0 to 1, and what was found so far."""
+        self.update(self._task, completed=done, found=found)
+        if not self.console.is_terminal and time.monotonic() - self._told_s > EVERY_S:
+            self._told_s = time.monotonic()
+            text = ", ".join(filter(None, (f"{self._what}: {done:.0%}", found)))
+            self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+class FrameProgress(LineProgress):
     """Progress of a replay, with the numbers of places and closures, and of closures by state in the graph."""
 
     def __init__(self, console: Console, graph_counts: Callable[[], Mapping[str, int]] = dict) -> None:
-        found = TextColumn("{task.fields[found]}")
-        columns = TextColumn("{task.description}"), BarColumn(), found, TimeRemainingColumn()
-        super().__init__(*columns, console=console, transient=True)
-        self._frames = self.add_task("Looking for loops", total=1.0, found="")
+        super().__init__(console, "Looking for loops")
         self._places = 0
         self._closures = 0
         self._graph_counts = graph_counts
@@ -38,21 +81,7 @@ class FrameProgress(Progress):
         if detection.closures:
             self._closures += len(detection.closures)
             self._graph = _in_graph(self._graph_counts())
-        found = f"{self._places} places, {self._closures} closures{self._graph}"
-        self.update(self._frames, completed=done, found=found)
-
-
-class ScanProgress(Progress):
-    """Progress of an engine that makes odometry from scans."""
-
-    def __init__(self, console: Console) -> None:
-        columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
-        super().__init__(*columns, console=console, transient=True)
-        self._scans = self.add_task("Odometry of the scans", total=1.0)
-
-    def show(self, done: float) -> None:
-        """Advance to the processed share of the recording, 0 to 1."""
-        self.update(self._scans, completed=done)
+        self.advance_to(done, f"{self._places} places, {self._closures} closures{self._graph}")
 
 
 def _in_graph(counts: Mapping[str, int]) -> str:

@@ -67,6 +67,7 @@ def command(
     recordings: Recordings,
     out: MapPath = Path("map"),
     config: options.ConfigPath = None,
+    changes: options.Changes = None,
     dataset: options.DatasetName = "auto",
     embedder: options.EmbedderName = None,
     weights: options.WeightsPath = None,
@@ -96,7 +97,8 @@ def command(
 
     console = Console()
     check_writable(out)
-    opening = Opening(config, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
+    parameters = options.parameters(config, changes)
+    opening = Opening(parameters, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
     found = find_recordings(recordings)
     bags = [open_bag(one) for one in found]  # before there is a folder
     target = MapFolder.open_or_create(out, opening.settings(bags[0]))
@@ -178,6 +180,7 @@ def export(
     map_folder: Annotated[Path, typer.Argument(help="Folder of the map.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the files; the map's by default.")] = None,
     config: options.ConfigPath = None,
+    changes: options.Changes = None,
 ) -> None:
     """Write where a rover can drive, as map.yaml and map.pgm for Nav2's map server, and the elevation as a GeoTIFF.
 
@@ -189,7 +192,7 @@ def export(
     from umf_ros.maps.outputs import export_terrain
 
     target, folder = MapFolder.open(map_folder), out or map_folder
-    settings = (load_settings(config) if config else target.settings).terrain
+    settings = load_settings(options.parameters(config or target.path / "config.yaml", changes)).terrain
     check_writable(folder)
     typer.echo(f"{folder}: {export_terrain(target, settings, folder)}")
 

@@ -22,11 +22,15 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from umf_ros.bags.reader import Bag
-    from umf_ros.core.config import Settings
+    from umf_ros.core.config import Parameters, ParameterSource, Settings
     from umf_ros.core.trajectory import Trajectory
 
 BagPath = Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")]
 ConfigPath = Annotated[Path | None, typer.Option("--config", help="Parameter file (YAML).")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="Set a parameter, as loop.top_k=40; may be given repeatedly."),
+]
 DatasetName = Annotated[str, typer.Option("--dataset", help=f"{either(['auto', *dataset_names()])}.")]
 EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"Embedding method: {choices()}.")]
 WeightsPath = Annotated[Path | None, typer.Option("--weights", help="Weights file; default: umf_scene.")]
@@ -59,6 +63,13 @@ def check_files(bag: Path, *others: Path | None) -> None:
             raise ConfigError(f"cannot read {path}: No such file or directory")
 
 
+def parameters(config: Path | None, changes: list[str] | None) -> Parameters:
+    """Return the parameters of `--config` and `--set`."""
+    from umf_ros.core.config import Parameters, parse_changes
+
+    return Parameters(config, parse_changes(changes or ()))
+
+
 def check_map(folder: Path | None) -> None:
     """Check that a folder, if one is given, holds a map."""
     if folder is not None and not (folder / "map.json").is_file():
@@ -67,14 +78,14 @@ def check_map(folder: Path | None) -> None:
 
 def open_recording(
     bag: Path,
-    config: Path | None = None,
+    config: ParameterSource = None,
     dataset: str = "auto",
     embedder: str | None = None,
     weights: Path | None = None,
     **overrides: Any,
 ) -> tuple[Bag, Settings]:
     """Open a recording, and load the settings to read it with; `overrides` are those of `load_settings`."""
-    check_files(bag, config)
+    check_files(bag)
 
     from umf_ros.bags.presets import settings_for
     from umf_ros.bags.reader import open_bag
@@ -138,7 +149,7 @@ class ChosenOdometry:
         """
         from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
         from umf_ros.bags.trajectories import read_odometry
-        from umf_ros.commands.console import ScanProgress
+        from umf_ros.commands.console import LineProgress
         from umf_ros.core.config import topics_of
 
         if self.path is not None:
@@ -148,8 +159,8 @@ class ChosenOdometry:
         told: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
         console.print(f"odometry: {self.engine} on the scans of {topics_of(settings).cloud}", **told)
         try:
-            with ScanProgress(console) as progress:
-                return odometry_of_scans(recording, settings, self.engine, made, progress.show)
+            with LineProgress(console, "Odometry of the scans") as progress:
+                return odometry_of_scans(recording, settings, self.engine, made, progress.advance_to)
         except BagError as error:
             if self.is_wanted:
                 raise
@@ -167,3 +178,23 @@ class ChosenOdometry:
         path = (folder / MADE_ODOMETRY).resolve()
         write_tum(path, made)
         return {"path": str(path), "frame": "body", "engine": self.engine}
+
+
+def show_parameters(
+    config: ConfigPath = None,
+    changes: Changes = None,
+    bag: Annotated[Path | None, typer.Argument(metavar="[BAG]", help="Recording that decides the topics.")] = None,
+) -> None:
+    """Print the effective parameters: defaults, those of --config and of --set; for a recording with its topics.
+
+    The output is a parameter file.
+    """
+    if bag is not None:
+        settings = open_recording(bag, parameters(config, changes))[1]
+    else:
+        from umf_ros.core.config import load_settings
+
+        settings = load_settings(parameters(config, changes))
+    from umf_ros.core.config import dump_settings
+
+    typer.echo(dump_settings(settings), nl=False)

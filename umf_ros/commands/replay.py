@@ -33,6 +33,7 @@ MapPath = Annotated[
 def command(
     bag: options.BagPath,
     config: options.ConfigPath = None,
+    changes: options.Changes = None,
     out: options.RunsFolder = Path("results"),
     dataset: options.DatasetName = "auto",
     embedder: options.EmbedderName = None,
@@ -57,35 +58,37 @@ def command(
     options.check_files(bag, config, chosen.path, ground_truth)
     options.check_map(map_folder)
 
-    recording, settings = options.open_recording(
-        bag,
-        config,
-        dataset,
-        embedder,
-        weights,
-        verification__min_probability=min_probability,
-        mode=mode or ("localization" if map_folder else None),
-        map=str(map_folder) if map_folder else None,
-    )
-    from umf_ros.detector import LoopDetector, make_detector_embedder
-
-    # the network is compiled while the rest is imported
-    starting = ThreadPoolExecutor(1, "start").submit(make_detector_embedder, settings)
     from rich.console import Console
 
-    from umf_ros.bags.frames import FrameReader
-    from umf_ros.bags.inputs import absent_inputs, input_counts
-    from umf_ros.bags.trajectories import read_ground_truth
-    from umf_ros.commands.console import WARNING, FrameProgress, stop_on_interrupt, undisturbed
-    from umf_ros.core.resources import MADE_ODOMETRY
-    from umf_ros.core.watchdog import watching
-    from umf_ros.replay import Replay
-    from umf_ros.runs.reader import read_run, remember_recording
-    from umf_ros.runs.rerun_log import RerunLog
-    from umf_ros.runs.run_file import read_odometry_of
-    from umf_ros.runs.writer import count_drops, create_folder, finish_folder, unfinished_folder, with_places
+    from umf_ros.commands.console import WARNING, FrameProgress, stop_on_interrupt, undisturbed, waiting
 
     console = Console()
+    with waiting(console, "Opening the recording"):
+        recording, settings = options.open_recording(
+            bag,
+            options.parameters(config, changes),
+            dataset,
+            embedder,
+            weights,
+            verification__min_probability=min_probability,
+            mode=mode or ("localization" if map_folder else None),
+            map=str(map_folder) if map_folder else None,
+        )
+        from umf_ros.detector import LoopDetector, make_detector_embedder
+
+        # the network is compiled while the rest is imported
+        starting = ThreadPoolExecutor(1, "start").submit(make_detector_embedder, settings)
+        from umf_ros.bags.frames import FrameReader
+        from umf_ros.bags.inputs import absent_inputs, input_counts
+        from umf_ros.bags.trajectories import read_ground_truth
+        from umf_ros.core.resources import MADE_ODOMETRY
+        from umf_ros.core.watchdog import watching
+        from umf_ros.replay import Replay
+        from umf_ros.runs.reader import read_run, remember_recording
+        from umf_ros.runs.rerun_log import RerunLog
+        from umf_ros.runs.run_file import read_odometry_of
+        from umf_ros.runs.writer import count_drops, create_folder, finish_folder, unfinished_folder, with_places
+
     _tell_inputs(console, settings)
     warnings: list[str] = []
     warn = partial(_warn, console, warnings)
@@ -94,15 +97,16 @@ def command(
     truth = read_ground_truth(None, ground_truth)
     unfinished = unfinished_folder(out, bag, settings) if resume else None
     path = chosen.read(console, recording, settings, unfinished and unfinished / MADE_ODOMETRY, warn)
-    reader = FrameReader(recording, settings, path, warn=warn)
-    network = starting.result()
-    viewer = RerunLog(rerun, settings.terrain) if rerun else None
-    # a store or a map that cannot be used is reported before there is a folder
-    known = settings.database.path or (settings.localizing and not settings.grows_map)
-    detector = LoopDetector(settings, network) if known else None
-    folder = unfinished or create_folder(out, bag)
-    known_odometry = chosen.keep(folder, path)
-    detector = detector or LoopDetector(with_places(settings, folder), network)
+    with waiting(console, "Loading the network"):
+        reader = FrameReader(recording, settings, path, warn=warn)
+        network = starting.result()
+        viewer = RerunLog(rerun, settings.terrain) if rerun else None
+        # a store or a map that cannot be used is reported before there is a folder
+        known = settings.database.path or (settings.localizing and not settings.grows_map)
+        detector = LoopDetector(settings, network) if known else None
+        folder = unfinished or create_folder(out, bag)
+        known_odometry = chosen.keep(folder, path)
+        detector = detector or LoopDetector(with_places(settings, folder), network)
     del network, starting  # only the detector keeps the network, until it is closed: the report needs the memory
     absent = [one.line for one in absent_inputs(recording, settings, path is not None)]
     for line in absent:

@@ -20,6 +20,7 @@ def command(
     bag: options.BagPath,
     out: MapPath = Path("slam"),
     config: options.ConfigPath = None,
+    changes: options.Changes = None,
     dataset: options.DatasetName = "auto",
     embedder: options.EmbedderName = None,
     weights: options.WeightsPath = None,
@@ -31,4 +32,4 @@ def command(
     Scans alone are enough. The same command continues where it was killed; umf map adds further recordings.
     """
     options.check_files(bag, config, odometry)
-    maps.command([bag], out, config, dataset, embedder, weights, 1, None, odometry, odometry_frame)
+    maps.command([bag], out, config, changes, dataset, embedder, weights, 1, None, odometry, odometry_frame)

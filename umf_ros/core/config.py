@@ -6,6 +6,10 @@ Numbers carry their unit in the name.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -38,6 +42,8 @@ def without_password(address: str) -> str:
     return address
 
 
+AUTO = "auto"
+"""Data set that the topics of a recording decide."""
 TRANSFORMS = "tf"
 """Calibration in place of a file: `/tf_static` and camera_info say how the rig is built, or its messages wait."""
 Dataset = Annotated[str, AfterValidator(_known)]
@@ -323,19 +329,81 @@ class Settings(Group):
         return self.frames.extrinsics == "tf" and self.dataset == DEFAULT_DATASET
 
 
-def load_settings(path: str | Path | None = None, **overrides: Any) -> Settings:
+@dataclass(frozen=True)
+class Parameters:
+    """A parameter file, if there is one, with changes to it: overrides of `load_settings`."""
+
+    path: Path | None = None
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+
+ParameterSource = str | Path | Parameters | None
+
+
+def load_settings(source: ParameterSource = None, **overrides: Any) -> Settings:
     """Return the settings in a YAML file, plain or with ROS parameters (`/**: ros__parameters:`); None: the defaults.
 
-    Overrides are by dotted name with `__` for the dot, as in `loop__top_k=10`; None is skipped.
+    Overrides are by dotted name with `__` for the dot, as in `loop__top_k=10`; None is skipped. Relative paths in the
+    file are relative to it, those of overrides to the working folder; both are returned as absolute ones.
 
     Raises:
-        ConfigError: the file cannot be read, or a name, type or value is wrong.
+        ConfigError: the file cannot be read or is empty, or a name, type or value is wrong.
     """
-    values = _node_parameters(read_values(Path(path)), path) if path else {}
-    for name, value in overrides.items():
-        if value is not None:
-            _set(values, name.split("__"), value)
-    return parse_settings(values)
+    chosen = source if isinstance(source, Parameters) else Parameters(Path(source) if source else None)
+    path, overrides = chosen.path, {**chosen.changes, **{k: v for k, v in overrides.items() if v is not None}}
+    values = _read_parameters(path) if path else {}
+    given = {name.replace("__", "."): value for name, value in overrides.items()}
+    for name, value in given.items():
+        _set(values, name.split("."), _anchored(name, value, Path()))
+    if values.get("dataset") == AUTO:
+        del values["dataset"]
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        named = {".".join(map(str, problem["loc"])) for problem in error.errors()}
+        raise ConfigError(f"{path}: {_problems(error)}" if path and named - set(given) else _problems(error)) from None
+
+
+def parse_changes(changes: Iterable[str]) -> dict[str, Any]:
+    """Return overrides of `load_settings` from texts such as "loop.top_k=20", whose values are YAML.
+
+    Raises:
+        ConfigError: a text has no name or no value.
+    """
+    found = {}
+    for change in changes:
+        name, equals, text = change.partition("=")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError:
+            value = text
+        if not name or not equals:
+            raise ConfigError(f"--set {change}: expected NAME=VALUE, as in loop.top_k=20")
+        found[name.strip().replace(".", "__")] = "" if value is None else value
+    return found
+
+
+_PATHS = ("calibration", "map", "embedding.weights", "database.path")
+
+
+def _anchored(name: str, value: Any, folder: Path) -> Any:
+    """Return the value of a parameter, a relative path of a file as the absolute one below a folder."""
+    if name not in _PATHS or not isinstance(value, str) or value in ("", TRANSFORMS, *dataset_names()):
+        return value
+    return str((folder / value).absolute())
+
+
+def _read_parameters(path: Path) -> dict[str, Any]:
+    content = read_values(path)
+    if not content:
+        raise ConfigError(f"{path} is empty: it sets no parameter")
+    values = _node_parameters(content, path)
+    for name in _PATHS:
+        group, _, last = name.rpartition(".")
+        holder = values.get(group) if group else values
+        if isinstance(holder, dict) and last in holder:
+            holder[last] = _anchored(name, holder[last], path.parent)
+    return values
 
 
 def load_preset(dataset: str) -> DatasetPreset:
@@ -369,7 +437,7 @@ def parse_settings(values: dict[str, Any]) -> Settings:
     try:
         return Settings.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(problems(error)) from None
+        raise ConfigError(_problems(error)) from None
 
 
 def dump_settings(settings: Settings) -> str:
@@ -410,18 +478,39 @@ def _node_parameters(content: dict[str, Any], path: str | Path) -> dict[str, Any
 NODE_ONLY = frozenset({"use_sim_time", "results_dir", "autostart"})
 
 
-def problems(error: ValidationError) -> str:
-    """Return every wrong value with its error, on one line."""
-    return "; ".join(_explain(problem) for problem in error.errors())
+def problems(error: ValidationError, known: Collection[str] = ()) -> str:
+    """Return every wrong value with its error, on one line; for an unknown name the nearest of the `known` ones."""
+    return "; ".join(_explain(problem, known) for problem in error.errors())
 
 
-def _explain(problem: Any) -> str:
+def _problems(error: ValidationError) -> str:
+    return problems(error, _names())
+
+
+@cache
+def _names() -> tuple[str, ...]:
+    """Return the names of all parameters and groups."""
+    names = dict.fromkeys(Settings.model_fields)
+    for group, info in Settings.model_fields.items():
+        names |= dict.fromkeys(f"{group}.{name}" for name in getattr(info.annotation, "model_fields", ()))
+    return tuple(names)
+
+
+def _nearest(name: str, known: Collection[str]) -> str:
+    """Return the known name with the same last part, or else the most similar one; empty without one."""
+    last = name.rpartition(".")[2]
+    same = [one for one in known if one.rpartition(".")[2] == last]
+    return next(iter(same or get_close_matches(name, known, 1)), "")
+
+
+def _explain(problem: Any, known: Collection[str]) -> str:
     name = ".".join(str(part) for part in problem["loc"])
     text = str(problem["msg"]).removeprefix("Value error, ")
     if not name:  # of several values together
         return text
     if problem["type"] == "extra_forbidden":
-        return f"unknown parameter {name}"
+        nearest = _nearest(name, known)
+        return f"unknown parameter {name}" + (f"; did you mean {nearest}?" if nearest else "")
     if problem["type"] == "missing":
         return f"{name} is missing"
     got = "" if problem["type"] == "value_error" else f" (got {problem['input']!r})"  # may hold a password

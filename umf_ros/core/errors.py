@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -105,6 +106,11 @@ def reading(path: object, kind: type[UmfError], fault: str) -> Iterator[None]:
         raise kind(f"cannot read {shortened(path)}: {error.strerror or one_line(error)}") from None
     except Exception as error:
         raise kind(f"{shortened(path)} {fault}: {one_line(error)}") from None
+
+
+def command_line(*words: object) -> str:
+    """Return a command of `umf` with its arguments as a shell takes it: for messages."""
+    return shlex.join(["umf", *map(str, words)])
 
 
 def either(names: Sequence[str]) -> str:

@@ -403,13 +403,21 @@ def read_yaml(path: Path) -> Any:
         ConfigError: the file cannot be read.
     """
     with reading(path, ConfigError, "is not valid YAML"):
-        text, depth = read_text(path), 0
-        for number, event in enumerate(yaml.parse(text, _Loader)):  # the loader in C overflows its stack where it nests
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > DEEPEST or number > MOST_NODES:
-                raise ValueError(f"more than {DEEPEST} levels of nesting, or {MOST_NODES} nodes")
-        _count_nodes(yaml.compose(text, _Loader), {})
-        return yaml.load(text, _Loader)
+        text, depth = read_text(path).removeprefix("\ufeff"), 0
+        try:
+            for number, event in enumerate(yaml.parse(text, _Loader)):  # the loader in C overflows where it nests
+                depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+                if depth > DEEPEST or number > MOST_NODES:
+                    raise ValueError(f"more than {DEEPEST} levels of nesting, or {MOST_NODES} nodes")
+            _count_nodes(yaml.compose(text, _Loader), {})
+            return yaml.load(text, _Loader)
+        except yaml.MarkedYAMLError as error:
+            where = _place(error.problem_mark or error.context_mark)
+            raise ValueError(f"{where}{error.problem or error.context}") from None
+
+
+def _place(mark: Any) -> str:
+    return f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
 
 
 def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
@@ -428,7 +436,7 @@ def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
     elif isinstance(node, yaml.MappingNode):
         for name, times in Counter(str(getattr(key, "value", "")) for key, _ in node.value).items():
             if times > 1 and name != "<<":
-                raise ValueError(f"{name} is given twice{node.start_mark}")
+                raise ValueError(f"{_place(node.start_mark)}{name} is given twice")
         count = sum(_count_nodes(item, known) for pair in node.value for item in pair)
     known[id(node)] = count + 1
     if count > MOST_NODES:

@@ -28,9 +28,9 @@ from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
 from umf_ros.bags.trajectories import read_odometry
-from umf_ros.core.config import Database, Settings, topics_of
+from umf_ros.core.config import Database, ParameterSource, Settings, topics_of
 from umf_ros.core.errors import BagError, UmfError, writing
-from umf_ros.core.frames import Keyframe
+from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.io import lock_file, write_table
 from umf_ros.core.limits import read_json
 from umf_ros.core.resources import MADE_ODOMETRY, ODOMETRY_ENGINES
@@ -68,7 +68,7 @@ class Opening:
         odometry_frame: frame whose poses the files hold.
     """
 
-    config: Path | None = None
+    config: ParameterSource = None
     dataset: str = "auto"
     embedder: str | None = None
     weights: str | None = None

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import inf, nan
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -13,13 +14,13 @@ import numpy as np
 from umf_ros.bags.inputs import SEVERITIES, Advice, Severity, absent_inputs, useless_inputs
 from umf_ros.bags.reader import Bag
 from umf_ros.core.config import Settings
-from umf_ros.core.errors import UmfError
+from umf_ros.core.errors import UmfError, command_line
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.diagnosis import ClosureDiagnosis, explain
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import read_absolute_verdicts
 from umf_ros.runs.truth import JudgedRun, in_words, judge_run
-from umf_ros.runs.writer import write_summary
+from umf_ros.runs.writer import is_unfinished, write_summary
 from umf_ros.sensors.sensor_check import SENSORS, Overlay, SensorReport, describe_turn, find_contradictions
 
 REFUSED = (
@@ -33,8 +34,8 @@ REACH = "the odometry must reach the keyframes of the closures"
 FEW_VIEWS, BIAS_PX = 5, 0.25
 """Least number of closures by images for a bias of the disparities, by hand, and least bias (*measured* on simulated
 drives, 26201 to 26205: .09 px is found in right images, .34 and more in images that are off by half a pixel)."""
-SLOW = 1.0
-"""Recorded time over processing time, below which a rover outruns the detector."""
+SLOW, SPARE = 1.0, 1.2
+"""Recorded time over processing time, below which a rover outruns the detector; margin of the remedy, by hand."""
 SHARES = 4
 """A match may be a quarter of the run back, and without odometry a quarter has as many keyframes: by hand."""
 MOST_EXPLAINED = 200
@@ -57,9 +58,15 @@ def _inputs(about: JudgedRun) -> Iterator[Advice]:
     odometry_from_file = bool(about.run.summary.get("odometry_file")) or about.run.odometry is not None
     if about.bag is not None:
         yield from absent_inputs(about.bag, about.run.settings, odometry_from_file)
-    yield from useless_inputs(about.run.summary.get("inputs", {}))
+    yield from useless_inputs(about.run.summary.get("inputs", {}), _recording(about))
     for text in about.run.summary.get("warnings", []):
         yield Advice("warning", text)
+
+
+def _recording(about: JudgedRun) -> Path | None:
+    """Return the path of the recording of a run, if it is known."""
+    known = about.run.summary.get("recording", {}).get("path")
+    return about.bag.path if about.bag is not None else known and Path(known)
 
 
 def about_truth(about: JudgedRun) -> Iterator[Advice]:
@@ -110,7 +117,9 @@ def _pairs(about: JudgedRun) -> Iterator[Advice]:
         yield Advice("fault", what, "the clocks of camera and LiDAR differ, or sync.slop_s is too small")
     if not summary["keyframes"]:
         what = f"none of {summary['frames']} frames became a keyframe"
-        yield Advice("fault", what, "umf inspect lists the contents of the recording")
+        bag = _recording(about)
+        remedy = "" if bag is None else f"contents of the recording: {command_line('inspect', bag)}"
+        yield Advice("fault", what, remedy)
 
 
 def _gaps(about: JudgedRun) -> Iterator[Advice]:
@@ -198,7 +207,7 @@ def _closures(about: JudgedRun) -> Iterator[Advice]:
         share = f"{number / len(whys):.0%} of them at the gate '{gate}'"
         what = f"{count} of {revisits} revisits are missed, {share} (at {at_s:.1f} s: {first.what})"
         severity: Severity = "fault" if count == revisits and not about.run.closures else "warning"
-        yield Advice(severity, what, first.parameter or "umf why RUN STAMP explains each")
+        yield Advice(severity, what, first.parameter or f"all of them: {command_line('why', about.run.folder)}")
 
 
 def _unjudged(about: JudgedRun) -> Iterator[Advice]:
@@ -209,7 +218,7 @@ def _unjudged(about: JudgedRun) -> Iterator[Advice]:
     best = max(run.candidates, key=lambda one: one.probability or 0)
     at_s = (best.query_stamp_ns - int(run.stamps[0])) * 1e-9
     what = f"none of {len(run.candidates)} candidates became a closure; the best ({best.outcome}) is at {at_s:.1f} s"
-    yield Advice("warning", what, f"umf why {run.folder.name} {best.query_stamp_ns}")
+    yield Advice("warning", what, f"its reasons: {command_line('why', run.folder, best.query_stamp_ns)}")
 
 
 def _disparity(about: JudgedRun) -> Iterator[Advice]:
@@ -245,20 +254,36 @@ def _map(about: JudgedRun) -> Iterator[Advice]:
 
 
 def _speed(about: JudgedRun) -> Iterator[Advice]:
-    summary, costs = about.run.summary, "verification.refine_best and loop.top_k cost the most"
-    if summary["drops"].get("worker"):
-        what = f"{summary['drops']['worker']} frames were dropped because the machine was too slow"
-        yield Advice("warning", what, f"{costs}, keyframe.* sets their number")
+    summary, now_m = about.run.summary, about.run.settings.keyframe.min_translation_m
+
+    def fewer_keyframes(excess: float) -> str:
+        return f"fewer keyframes: --set keyframe.min_translation_m={SPARE * excess * now_m:.2g} (now {now_m:g})"
+
     factor = summary.get("realtime_factor", SLOW)
-    if summary["keyframes"] and 0 < factor < SLOW:
-        what = f"slower than the recording: {factor:.2f} of its speed"
-        yield Advice("note", what, f"{costs}, keyframe.min_translation_m sets their number")
+    if dropped := summary["drops"].get("worker"):
+        what = f"{dropped} frames were dropped because the machine was too slow"
+        yield Advice("warning", what, fewer_keyframes(1 + dropped / max(summary["frames"], 1)))
+    elif summary["keyframes"] and 0 < factor < SLOW:
+        yield Advice("note", f"slower than the recording: {factor:.2f} of its speed", fewer_keyframes(1 / factor))
 
 
 def _end(about: JudgedRun) -> Iterator[Advice]:
     if about.run.summary.get("interrupted"):
         what = "the run did not end: results cover the part before"
-        yield Advice("warning", what, "umf replay --resume continues a replay")
+        bag = _recording(about)
+        is_replay = bag is not None and is_unfinished(about.run.folder, bag)
+        yield Advice("warning", what, f"continue it: {_again(about, bag)}" if is_replay else "")
+
+
+def _again(about: JudgedRun, bag: Path | None) -> str:
+    """Return the command that continues a replay, with the options that it was started with."""
+    folder, made = about.run.folder, about.run.summary.get("odometry_file") or {}
+    words = ["replay", bag, "--config", folder / "config.yaml", "--out", folder.parent, "--resume"]
+    if "engine" in made:
+        words += ["--odometry", made["engine"]]
+    elif made:
+        words += ["--odometry", made["path"], "--odometry-frame", made["frame"]]
+    return command_line(*words)
 
 
 BLANK, DIM = 3.0, 8.0
@@ -341,7 +366,7 @@ def _clocks(lags: dict[str, float]) -> Iterator[Advice]:
         yield Advice("fault", what, "correct the stamps in its driver (PTP, or a constant): no parameter does")
 
 
-_CAUSES = (about_truth, _gaps, lambda about: about_sensors(about.sensors), _disparity, _pairs, _inputs)
+_CAUSES = (about_truth, _gaps, _inputs, _pairs, lambda about: about_sensors(about.sensors), _disparity)
 _EFFECTS = (_graph, _absolute, _closures, _unjudged, _map, _stated_errors, _speed, _end)
 
 

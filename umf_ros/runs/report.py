@@ -17,6 +17,7 @@ from rich.table import Table as Grid
 
 from umf_ros.bags.inputs import Advice
 from umf_ros.bags.reader import Bag
+from umf_ros.core.errors import command_line
 from umf_ros.core.io import write_atomically
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.findings import RunVerdict, conclude, judge, look_first
@@ -68,6 +69,7 @@ def write_page(about: JudgedRun, verdict: RunVerdict, findings: Sequence[Advice]
         findings=findings,
         facts=_facts(run.summary),
         closures=closure_rows(about),
+        why=command_line("why", run.folder),
         scene=_inside_a_script(scene),
         plotly=get_plotlyjs(),
         version=run.summary["version"],

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from umf_ros.core.errors import command_line
 from umf_ros.core.frames import Points
 from umf_ros.core.geometry import Array, evenly, relative, rotation_angle, transform
 from umf_ros.core.trajectory import Trajectory
@@ -266,6 +267,8 @@ def build_scene(
         "curves": [{"name": name, "xyz": _thin(xyz).T.tolist()} for name, xyz in named_curves(about.run).items()],
         "keyframes": _keyframes(about),
         "pairs": list(pairs.values()),
+        "opened": _opened(list(pairs.values())),
+        "explain": command_line("explain", about.run.folder),
         "photographs": photographs,
         "scans": scans,
         "scan_unit_m": SCAN_UNIT_M,
@@ -275,6 +278,19 @@ def build_scene(
         "errors": error_curves(about.run) or None,
         "map": _map_picture(heights),
     }
+
+
+def _opened(pairs: list[dict[str, Any]]) -> int:
+    """Return the pair that the page opens on: a false closure, else a typical accepted one, else the first of all.
+
+    Typical is the one with the median number of image features, or the median probability where there are no images.
+    """
+    kinds = [pair["kind"] for pair in pairs]
+    accepted = [row for row, kind in enumerate(kinds) if kind == "accepted"]
+    if "false" in kinds or not accepted:
+        return next((kinds.index(kind) for kind in ORDER if kind in kinds), -1)
+    accepted.sort(key=lambda row: (pairs[row].get("inlier_count", 0), pairs[row]["p"] or 0))
+    return accepted[len(accepted) // 2]
 
 
 def _map_picture(heights: HeightMap | None) -> dict[str, Any] | None:

@@ -20,6 +20,8 @@ from umf_ros.core.resources import dataset_names
 
 TO_BE_MEASURED = "TO BE MEASURED"
 """Mark of an entry of a file that `umf inspect` or `umf import` guessed."""
+NO_CAMERA = StereoCamera(0, 0, 1.0, 1.0, 0.0, 0.0, 0.0)
+"""Intrinsics of a camera that nothing is known of."""
 LARGEST_IMAGE = 20_000
 """Pixels of a side."""
 
@@ -143,6 +145,7 @@ class Calibration:
         guesses: entries of the file that are marked as guesses.
         antenna: (3,) m, the GNSS antenna.
         is_open: whether nothing is known yet: `/tf_static` and camera_info have to say it.
+        lacks: "camera" or "lidar", where the file leaves it out: that of a rover without it.
         rectifier: makes the pair of `camera` from raw images; None where they arrive rectified.
     """
 
@@ -157,6 +160,7 @@ class Calibration:
     guesses: tuple[str, ...] = ()
     antenna: Array = field(default_factory=lambda: np.zeros(3))
     is_open: bool = False
+    lacks: tuple[str, ...] = ()
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -182,7 +186,7 @@ class Calibration:
 def calibration_of(settings: Settings) -> Calibration:
     """The calibration that the settings name, else that of the data set; raises as `load_calibration`."""
     if settings.calibration == TRANSFORMS:
-        return Calibration(StereoCamera(0, 0, 1.0, 1.0, 0.0, 0.0, 0.0), np.eye(4), np.eye(4), is_open=True)
+        return Calibration(NO_CAMERA, np.eye(4), np.eye(4), is_open=True)
     return load_calibration(settings.calibration or settings.dataset)
 
 
@@ -247,27 +251,33 @@ class _RawPair(Group):
 
 
 class _File(Group):
-    """Contents of a calibration file."""
+    """Contents of a calibration file; a rover without a camera or without a LiDAR leaves out its entries."""
 
     camera: _Camera | None = None
     raw_camera: _RawPair | None = None
-    body_T_camera: _Pose
-    body_T_lidar: _Pose
+    body_T_camera: _Pose | None = None
+    body_T_lidar: _Pose | None = None
     body_T_imu: _Pose
-    lidar_time_offset_s: float = Field(ge=-3600, le=3600)
+    lidar_time_offset_s: float = Field(0.0, ge=-3600, le=3600)
     min_intensity: float = Field(0.0, ge=0)
     max_height_m: float = Field(0.0, ge=0)
     antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
-    def _one_camera(self) -> _File:
-        if (self.camera is None) == (self.raw_camera is None):
-            raise ValueError("expected either camera (rectified images) or raw_camera")
+    def _of_a_sensor(self) -> _File:
+        cameras = (self.camera is not None) + (self.raw_camera is not None)
+        if cameras != (self.body_T_camera is not None):
+            raise ValueError("expected body_T_camera with either camera (rectified images) or raw_camera")
+        if not cameras and self.body_T_lidar is None:
+            raise ValueError("expected body_T_lidar, or body_T_camera with camera or raw_camera")
         return self
 
     def calibration(self) -> Calibration:
-        body_T_camera = self.body_T_camera.matrix()
-        if self.camera is not None:
+        poses = {"camera": self.body_T_camera, "lidar": self.body_T_lidar}
+        body_T_camera, body_T_lidar = (np.eye(4) if one is None else one.matrix() for one in poses.values())
+        if self.body_T_camera is None:
+            rectifier, camera = None, NO_CAMERA
+        elif self.camera is not None:
             rectifier, camera = None, StereoCamera(**self.camera.model_dump())
         else:
             raw = self.raw_camera
@@ -277,11 +287,12 @@ class _File(Group):
         return Calibration(
             camera,
             body_T_camera,
-            self.body_T_lidar.matrix(),
+            body_T_lidar,
             self.body_T_imu.matrix(),
             self.lidar_time_offset_s,
             self.min_intensity,
             self.max_height_m or math.inf,
             rectifier,
             antenna=np.array(self.antenna),
+            lacks=tuple(name for name, pose in poses.items() if pose is None),
         )

@@ -250,10 +250,13 @@ def _describe(subject: str, one: Disagreement, mounting: Array | None) -> Contra
         return Contradiction(subject, what, f"{remedy}: {BODY_AXES}")
     what = f"the {sensor}'s mounting is off by {turned}, by its motion and the odometry"
     remedy = f"correct body_T_{subject} of the calibration or /tf_static"
-    if one.impossible:
-        quaternion = to_quaternion(make_pose(_nearest_axes(one.axes, stated) @ stated, np.zeros(3)))
-        remedy += f": quaternion x y z w [{', '.join(f'{number:.4f}' for number in quaternion)}]"
-    return Contradiction(subject, what, remedy)
+    return Contradiction(subject, what, f"{remedy}: {quaternion_words(_nearest_axes(one.axes, stated) @ stated)}")
+
+
+def quaternion_words(turn: Array) -> str:
+    """Return a rotation (3, 3) as the entry of a calibration."""
+    numbers = to_quaternion(make_pose(turn, np.zeros(3)))
+    return f"quaternion: [{', '.join(f'{number:.4f}' for number in numbers)}]"
 
 
 def _nearest_axes(axes: Array, mounting: Array) -> Array:

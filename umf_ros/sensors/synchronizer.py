@@ -20,6 +20,8 @@ _log = logging.getLogger(__name__)
 
 INPUTS: tuple[Input, ...] = ("left", "right", "cloud", ODOMETRY)
 
+_SENSORS: dict[Input, str] = {"left": "camera", "right": "camera", "cloud": "lidar"}
+
 STEREO_SLOP_NS = 17_000_000
 """Exposures of a pair carry the same stamp; half a period at 30 Hz separates neighbouring pairs."""
 
@@ -157,7 +159,8 @@ class Synchronizer:
     def use_mounting(self, poses: dict[str, Any]) -> None:
         """Replace poses of the sensors, `body_T_camera` or `body_T_lidar` by name."""
         if poses:
-            self._calibration = replace(self._calibration, **poses)
+            lacks = tuple(one for one in self._calibration.lacks if f"body_T_{one}" not in poses)
+            self._calibration = replace(self._calibration, lacks=lacks, **poses)
 
     def add(self, name: Input, stamp_ns: int, value: Any) -> None:
         """Add a measurement: an image as the camera sends it, (H, W) uint8; a `Cloud`; or a (4, 4) pose `odom_T_body`.
@@ -165,6 +168,8 @@ class Synchronizer:
         Raises:
             MessageError: of kind "size" when the calibration is for other images.
         """
+        if (sensor := _SENSORS.get(name)) in self._calibration.lacks:
+            raise MessageError("transforms", f"the calibration has no body_T_{sensor}: add it, or leave out the topic")
         if name in ("left", "right") and self._window is not None:
             self._calibration = self._calibration.within(self._window, value.shape[::-1])
         expected = self._calibration.image_size

@@ -155,9 +155,10 @@ class BodyFrames:
             pose = pose @ self._calibration.rectifier.raw_T_rectified
         name = f"body_T_{sensor}"
         before = self._poses.get(name, getattr(self._calibration, name))
-        if np.allclose(pose, before, atol=1e-6):
+        is_known = name in self._poses or sensor not in self._calibration.lacks
+        if is_known and np.allclose(pose, before, atol=1e-6):
             return {}
-        if not self.is_open:
+        if is_known and not self.is_open:
             apart_m = float(np.linalg.norm(pose[:3, 3] - before[:3, 3]))
             where = f"its pose is that of {frame_id} in {self._base} on {TOPIC}"
             self._warn(f"{sensor}: {where}, {apart_m:.2f} m from the file's")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 
 from umf_ros.core.config import TRANSFORMS, Settings, Topics, load_preset, topics_of
@@ -29,8 +30,8 @@ def find_topics(types: Mapping[str, str]) -> tuple[Topics, dict[str, list[str]]]
 
     The candidates of inputs for which there are several are returned too, by input.
 
-    An image is of the camera in whose namespace it is. Two cameras are a pair where one is called right as the other
-    is called left. Cameras without a camera_info count where no camera has one.
+    An image is of the camera in whose namespace it is. Two cameras are a pair where one is called right or r as the
+    other is called left or l. Cameras without a camera_info count where no camera has one.
     """
     fits = {
         name: sorted(topic for topic, kind in types.items() if kind in kinds and not is_own(topic))
@@ -79,6 +80,8 @@ def _pair(cameras: list[str]) -> tuple[str | None, str | None]:
     if len(cameras) == 2:
         for left, right in (cameras, cameras[::-1]):
             if "left" in left and left.replace("left", "right") == right:
+                return left, right
+            if right == re.sub(r"(?<![a-z])l(?![a-z])", "r", left):
                 return left, right
     return None, None
 

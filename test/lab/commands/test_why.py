@@ -32,7 +32,7 @@ def test_it_names_the_gate_and_lists_what_was_returned(run: Path) -> None:
     assert lines[0].startswith("keyframe ") and lines[0].endswith(" ns")
     assert lines[1].split(":")[0] in ("pose", "selection", "probability", "objection", "retrieval", "found")
     assert "would accept it: " in ended.out and "m by the truth" in ended.out
-    assert f"umf explain BAG {lines[0].split()[-2]} " in ended.out
+    assert f"umf explain {run} {lines[0].split()[-2]} " in ended.out
     assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
 
 

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import csv
 import json
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.commands.recordings import BagPath, ConfigPath, DatasetName, EmbedderName, WeightsPath, open_recording
+from umf_ros.commands.recordings import (
+    Changes,
+    ConfigPath,
+    DatasetName,
+    EmbedderName,
+    WeightsPath,
+    check_files,
+    open_recording,
+    parameters,
+)
 from umf_ros.core.errors import BagError, ConfigError, OutputError, UmfError, one_line, writing
 
 if TYPE_CHECKING:
@@ -39,6 +49,7 @@ def command(
     ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
     config: ConfigPath = None,
+    changes: Changes = None,
     dataset: DatasetName = "auto",
     embedder: EmbedderName = None,
     weights: WeightsPath = None,
@@ -70,13 +81,14 @@ def command(
     else:
         asked = [(_view(match, match_left, match_right), _view(query, query_left, query_right))]
     method = {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}
-    settings = load_settings(config, **method)
+    source = parameters(config, changes)
+    settings = load_settings(source, **method)
     errors = Console(stderr=True)
     views = ViewReader(
         make_detector_embedder(settings),
         calibration,
         bin_columns,
-        config,
+        source,
         dataset,
         warn=lambda text: errors.print(text, **WARNING),
         method=settings.embedding.method,
@@ -165,43 +177,67 @@ def _show(row: Row, as_json: bool) -> None:
 
 
 def explain(
-    bag: BagPath,
+    source: Annotated[Path, typer.Argument(metavar="RUN|BAG", help="A run folder, or a recording.")],
     query: Annotated[str, typer.Argument(help="The later moment: stamp in ns, or seconds from the start.")],
     match: Annotated[str, typer.Argument(help="The earlier moment, in the same units.")],
-    out: Annotated[Path, typer.Option(help="Picture to write.")] = Path("explanation.png"),
+    out: Annotated[Path | None, typer.Option(help="Picture to write; default: a new explanation.png.")] = None,
     config: ConfigPath = None,
+    changes: Changes = None,
     dataset: DatasetName = "auto",
     embedder: EmbedderName = None,
     weights: WeightsPath = None,
 ) -> None:
-    """Draw both images with their matches, the aligned scans, and the numbers of the decision."""
+    """Draw both images with their matches, the aligned scans, and the numbers of the decision.
+
+    A run folder stands for its recording, read with the parameters of the run.
+    """
+    moments = [_moment(text) for text in (query, match)]
+    check_files(source, config)
+
     from rich.console import Console
 
-    from umf_ros.bags.frames import FrameReader
-    from umf_ros.detector import make_detector_embedder, make_keyframe
-    from umf_ros.lab.evaluation.comparison import draw
-    from umf_ros.lab.evaluation.comparison import explain as explained
-    from umf_ros.lab.evaluation.place_views import nearest_frames
+    from umf_ros.commands.console import waiting
 
     console = Console()
-    moments = [_moment(text) for text in (query, match)]
-    recording, settings = open_recording(bag, config, dataset, embedder, weights)
-    network = make_detector_embedder(settings)
-    with console.status("looking for the two moments"):
-        found = nearest_frames(FrameReader(recording, settings), moments)
-    frames = []
-    for one in found:
-        if isinstance(one, BagError):
-            raise one
-        frames.append(one)
-    query_keyframe, match_keyframe = (make_keyframe(frame, network) for frame in frames)
-    explanation = explained(query_keyframe, match_keyframe, settings.verification)
-    draw(explanation, frames[0].left, frames[1].left, out)
+    with waiting(console, "Looking for the two moments"):
+        from umf_ros.bags.frames import FrameReader
+        from umf_ros.detector import make_detector_embedder, make_keyframe
+        from umf_ros.lab.evaluation.comparison import draw
+        from umf_ros.lab.evaluation.comparison import explain as explained
+        from umf_ros.lab.evaluation.place_views import nearest_frames
+
+        bag, config = _of_run(source, config) if (source / "summary.json").is_file() else (source, config)
+        recording, settings = open_recording(bag, parameters(config, changes), dataset, embedder, weights)
+        network = make_detector_embedder(settings)
+        frames = []
+        for one in nearest_frames(FrameReader(recording, settings), moments):
+            if isinstance(one, BagError):
+                raise one
+            frames.append(one)
+        query_keyframe, match_keyframe = (make_keyframe(frame, network) for frame in frames)
+        explanation = explained(query_keyframe, match_keyframe, settings.verification)
+        names = chain([Path("explanation.png")], (Path(f"explanation_{number}.png") for number in count(2)))
+        picture = out or next(path for path in names if not path.exists())
+        draw(explanation, frames[0].left, frames[1].left, picture)
     console.print(explanation.verdict, highlight=False)
     if explanation.best is not None:
+        agree = (
+            f"{len(explanation.pixels)} image features agree with the pose; inliers_image are those of its first guess"
+        )
+        console.print(f"  {agree}", highlight=False, soft_wrap=True)
         for name, value in explanation.best.measurements.items():
             console.print(f"  {name:22} {value:.4g}", highlight=False)
-    console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"wrote {picture}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _of_run(folder: Path, config: Path | None) -> tuple[Path, Path]:
+    """Return the recording and the parameter file of a run."""
+    from umf_ros.lab.commands.report import recording_of
+
+    bag = recording_of(folder)
+    if bag is None:
+        raise UmfError(f"{folder}: its recording is unknown or was moved; name it in place of the folder")
+    return bag, config or folder / "config.yaml"
 
 
 def _moment(text: str) -> Moment:

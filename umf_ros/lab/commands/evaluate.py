@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from umf_ros.commands.recordings import (
+    Changes,
     ConfigPath,
     DatasetName,
     OdometryFrame,
@@ -19,6 +20,7 @@ from umf_ros.commands.recordings import (
     check_files,
     check_odometry_options,
     open_recording,
+    parameters,
     refuse_unused,
 )
 from umf_ros.core.errors import ConfigError
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-    from umf_ros.core.config import Settings
+    from umf_ros.core.config import ParameterSource, Settings
     from umf_ros.core.frames import Frame
     from umf_ros.core.trajectory import Trajectory
     from umf_ros.lab.evaluation.methods_run import FrameSet
@@ -51,7 +53,7 @@ class RecordingOptions:
     """Command line options for a recording."""
 
     bag: Path
-    config: Path | None
+    config: ParameterSource
     dataset: str
     embedder: str | None
     odometry: Path | None
@@ -248,6 +250,7 @@ def command(
     json_file: Annotated[Path | None, Optional("--json", help="Also write the figures to this file.")] = None,
     out: RunsFolder = Path("results"),
     config: Annotated[Path | None, Optional(help="Parameter file (YAML), for a recording or place sets.")] = None,
+    changes: Changes = None,
     dataset: DatasetName = "auto",
     embedder: Annotated[str | None, Optional(help=f"How places are embedded: {choices()}.")] = None,
     odometry: Annotated[Path | None, typer.Option(help="Odometry as a TUM file, where the recording has none.")] = None,
@@ -271,23 +274,25 @@ def command(
     of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick, "--count": count != 4}
     of_lists: dict[str, object] = {"--rule": rule != "s3li"}
     of_recordings: dict[str, object] = {"--config": config, "--dataset": dataset != "auto", "--embedder": embedder}
-    of_recordings |= {"--odometry": odometry, "--ground-truth": ground_truth}
+    of_recordings |= {"--set": changes, "--odometry": odometry, "--ground-truth": ground_truth}
     every = EveryMethod(weights, trained, quick, out) if methods == "all" else None
     if data is None:
         refuse_unused("simulated worlds", of_lists | of_recordings)
         chosen = str(worlds), seed, count
         figures = every.worlds(*chosen) if every else _on_worlds(*chosen, quick, weights, out)
     elif listed and lists_place_sets(data):
-        allowed = () if every else ("--embedder", "--config")
+        allowed = () if every else ("--embedder", "--config", "--set")
         others = {name: value for name, value in of_recordings.items() if name not in allowed}
         refuse_unused("a list of place sets", of_worlds | of_lists | others)
-        figures = every.places(data) if every else _on_places(data, config, embedder, weights, out)
+        figures = every.places(data) if every else _on_places(data, parameters(config, changes), embedder, weights, out)
     elif listed:
         refuse_unused("a list of sequences", of_worlds | of_recordings)
         figures = every.sequences(data, rule) if every else _on_sequences(data, rule, weights, out)
     else:
         refuse_unused("a recording", of_worlds | of_lists | ({"--embedder": embedder} if every else {}))
-        opened = RecordingOptions(data, config, dataset, embedder, odometry, odometry_frame, ground_truth)
+        opened = RecordingOptions(
+            data, parameters(config, changes), dataset, embedder, odometry, odometry_frame, ground_truth
+        )
         figures = every.recording(opened) if every else _on_recording(opened, weights, out)
     if json_file is not None:
         import json
@@ -396,7 +401,9 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     return report.figures
 
 
-def _on_places(listing: Path, config: Path | None, embedder: str | None, weights: Path | None, out: Path) -> Figures:
+def _on_places(
+    listing: Path, config: ParameterSource, embedder: str | None, weights: Path | None, out: Path
+) -> Figures:
     from rich.console import Console
 
     from umf_ros.core.config import load_settings
@@ -420,6 +427,7 @@ def sensors(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated world and drive.")] = 1,
     config: ConfigPath = None,
+    changes: Changes = None,
     out: RunsFolder = Path("results"),
     workers: Annotated[int, typer.Option(min=1, max=3, help="Replays in parallel.")] = 2,
     report: Annotated[bool, typer.Option("--report", help="Also write a report for each replay.")] = False,
@@ -454,12 +462,12 @@ def sensors(
         if not bag.exists():
             simulate.write_drive(bag, console, "sensors", (seed, None))
     stretches = stretches_of(bag)
-    recording = open_bag(bag)
-    for line in describe_sensors(check_sensors(recording, settings_for(recording, config, "auto"))):
+    recording, source = open_bag(bag), parameters(config, changes)
+    for line in describe_sensors(check_sensors(recording, settings_for(recording, source, "auto"))):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     folder = create_run_folder(out)
     with console.status("replaying") as status:
-        runs = replay_all(bag, config, folder, report, workers, lambda done: status.update(f"replayed {done} of 3"))
+        runs = replay_all(bag, source, folder, report, workers, lambda done: status.update(f"replayed {done} of 3"))
     found = {name: score(about, stretches) for name, about in runs.items()}
     figures = {name: {where: asdict(one) for where, one in scores.items()} for name, scores in found.items()}
     write_atomically(folder / "sensors.json", json.dumps(figures, indent=2) + "\n")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from umf_ros.commands.recordings import BagPath, check_files
+from umf_ros.commands.recordings import BagPath, Changes, ConfigPath, check_files, parameters
 from umf_ros.core.errors import OutputError
 
 if TYPE_CHECKING:
@@ -24,32 +24,44 @@ def command(
     write: Annotated[
         Path | None, typer.Option("--write", help="Folder for my_rover.yaml and my_calibration.yaml.")
     ] = None,
+    config: ConfigPath = None,
+    changes: Changes = None,
 ) -> None:
-    """List the contents of a recording, the topics that would be used, and missing inputs.
+    """List the contents of a recording, the topics that umf replay would use, and missing inputs.
 
-    Exit status 3: a replay could not find any closure.
+    With --config, it says whether a replay with this file would work. Exit status 3: no replay could find a closure.
     """
-    check_files(bag)
+    check_files(bag, config)
     if write is not None and write.exists() and not write.is_dir():
         raise OutputError(f"cannot write to {write}: it is no folder")
 
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
+    from umf_ros.commands.console import waiting
+    from umf_ros.core.errors import command_line
     from umf_ros.lab.evaluation.inspection import inspect
     from umf_ros.runs.findings import USELESS
 
-    console, recording = Console(), open_bag(bag)
-    found = inspect(recording)
-    _tell(console, bag, recording, found)
+    console, source = Console(), parameters(config, changes)
+    with waiting(console, "Reading the recording"):
+        recording = open_bag(bag)
+        found = inspect(recording, source, for_file=write is not None)
     if write is not None:
-        _write(console, found, recording, write)
-    elif found.settings is None:
-        console.print(found.unknown, **PLAIN)
-    if not found.works:
-        console.print("It would find nothing.", style="red")
+        config, changes = _write(console, found, recording, write), None
+        with waiting(console, "Reading the recording"):
+            found = inspect(recording, parameters(config, changes))
+    given = [*(["--config", config] if config else []), *(word for one in changes or () for word in ("--set", one))]
+    _tell(console, bag, recording, found)
+    if found.fault:
+        console.print(f"Not usable for loop closure: {found.fault}", style="red", **PLAIN)
         raise typer.Exit(USELESS)
-    console.print("It would work.", style="green" if not found.advice else "")
+    ready = f"Ready for loop closure: {command_line('replay', bag, *given)}"
+    if found.unknown:
+        console.print(found.unknown.partition("; ")[0], **PLAIN)
+        first = command_line("inspect", bag, "--write", "config", *given)
+        ready = f"Ready for loop closure with a first parameter file: {first}"
+    console.print(ready, style="green", **PLAIN)
 
 
 def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None:
@@ -76,11 +88,12 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
         console.print(found.found["pairs"], **PLAIN)
     for one in found.advice:
         console.print(f"{one.severity}: {one.line}", style=COLOURS[one.severity], **PLAIN)
-    if found.settings is not None:
-        console.print(f"{describe_inputs(found.settings)}; umf replay {printable(bag)} needs no --config", **PLAIN)
+    if not found.unknown:
+        console.print(describe_inputs(found.settings), **PLAIN)
 
 
-def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> None:
+def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> Path:
+    """Write a parameter file and a calibration; return the path of the former."""
     from umf_ros.bags.frames import read_transforms
     from umf_ros.core.errors import writing
     from umf_ros.core.io import check_absent, write_atomically
@@ -88,15 +101,16 @@ def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> 
 
     settings, calibration = folder / "my_rover.yaml", folder / "my_calibration.yaml"
     check_absent(settings, calibration)
-    with writing(f"to {folder}"):
-        folder.mkdir(parents=True, exist_ok=True)
     known = calibration_of_dataset(found, recording)
     if known is None:
         text = write_calibration(found, read_transforms(recording, also_repeated=True))
     else:
         text = known.read_text(encoding="utf-8")
+    with writing(f"to {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
     write_atomically(calibration, text)
     write_atomically(settings, write_settings(found, str(calibration.resolve())))
     guesses = text.count(GUESS)
-    then = f"; {guesses} entries of the calibration are guesses: measure them" if guesses else ""
+    then = f"; entries of the calibration that are guesses, to be measured: {guesses}" if guesses else ""
     console.print(f"wrote {settings} and {calibration}{then}", **PLAIN)
+    return settings

@@ -19,14 +19,15 @@ if TYPE_CHECKING:
     from umf_ros.runs.truth import JudgedRun
 
 SHOWN = 8
-"""Candidates and criteria in the terminal."""
+"""Candidates and criteria in the terminal, and keyframes of a stage."""
 NEAR_NS = 10**9
 """A moment so much before the first or after the last keyframe is theirs."""
+RecordingPath = Annotated[Path | None, typer.Argument(help="The recording; default: that of the run.")]
 
 
 def command(
     folder: Annotated[Path, typer.Argument(help="A run folder, such as results/latest.")],
-    bag: Annotated[Path, typer.Argument(help="The recording the run was made on.")],
+    bag: RecordingPath = None,
     ground_truth: TruthPath = None,
 ) -> None:
     """Evaluate a run by the ground truth, draw its matches and trajectory, and write report.html.
@@ -34,16 +35,33 @@ def command(
     The tables and trajectories of a run that was killed are exported first. With the recording or the truth of another
     run, nothing is written.
     """
-    check_files(bag, ground_truth)
+    check_files(bag or Path(), ground_truth)
 
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
+    from umf_ros.commands.console import waiting
+
+    console = Console()
+    with waiting(console, "Reading the run"):
+        recover_run(folder)
+        recording = bag or recording_of(folder)
+        if recording is None:
+            raise UmfError(f"{folder}: its recording is unknown or was moved; name it after the folder")
+        opened = open_bag(recording)
+    report_run(folder, opened, console, ground_truth)
+
+
+def recording_of(folder: Path) -> Path | None:
+    """Return the recording that a run was made on; None where it is not known, or no longer there.
+
+    Raises:
+        UmfError: the folder holds no run.
+    """
     from umf_ros.runs.writer import read_summary
 
-    recover_run(folder)
-    read_summary(folder)
-    report_run(folder, open_bag(bag), Console(), ground_truth)
+    path = Path(read_summary(folder).get("recording", {}).get("path", ""))
+    return path if path.name and path.exists() else None
 
 
 def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | None = None) -> RunVerdict:
@@ -75,57 +93,95 @@ def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | No
 
 def why(
     folder: Annotated[Path, typer.Argument(help="A run folder, such as results/latest.")],
-    moment: Annotated[str, typer.Argument(metavar="STAMP", help="Stamp in ns, or seconds from the first keyframe.")],
-    bag: Annotated[
-        Path | None, typer.Argument(help="The recording, for its ground truth; default: the path in the run.")
+    moment: Annotated[
+        str | None,
+        typer.Argument(metavar="[STAMP]", help="Stamp in ns, or seconds from the first keyframe; default: all."),
     ] = None,
+    bag: RecordingPath = None,
     ground_truth: TruthPath = None,
 ) -> None:
     """Explain why a keyframe closed no loop: its candidates, the stage that rejected them, and the margin.
 
-    Also prints the parameter that would accept it, and the effect on other closures. Reads the run folder only.
+    Also prints the parameter that would accept it, and the effect on other closures. Reads the run folder only. Without
+    a stamp, it lists the stages that rejected keyframes, those with most of them first.
     """
+    asked = None if moment is None else _moment(moment)
+
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
     from umf_ros.bags.trajectories import read_ground_truth
+    from umf_ros.commands.console import waiting
     from umf_ros.runs.diagnosis import explain
     from umf_ros.runs.findings import judge
     from umf_ros.runs.reader import read_run
-    from umf_ros.runs.writer import read_summary
 
-    recover_run(folder)
-    summary = read_summary(folder)
-    known = bag or Path(summary.get("recording", {}).get("path", ""))
-    recording: Bag | None = open_bag(known) if bag or known.is_file() or (known.is_dir() and known.name) else None
-    truth = read_ground_truth(recording, ground_truth)
-    about = judge(read_run(folder, recording, truth), recording, keep=False)
+    console = Console()
+    with waiting(console, "Reading the run"):
+        recover_run(folder)
+        known = bag or recording_of(folder)
+        recording: Bag | None = None if known is None else open_bag(known)
+        truth = read_ground_truth(recording, ground_truth)
+        about = judge(read_run(folder, recording, truth), recording, keep=False)
     if not len(about.run.keyframes):
         raise UmfError(f"{folder} holds no keyframe")
+    if asked is None:
+        _list(console, about)
+        return
     first_ns, last_ns = int(about.run.stamps[0]), int(about.run.stamps[-1])
-    asked_ns = _stamp(moment, first_ns)
+    asked_ns = asked if isinstance(asked, int) else first_ns + round(asked * 1e9)
     if not first_ns - NEAR_NS <= asked_ns <= last_ns + NEAR_NS:
         seconds = (last_ns - first_ns) * 1e-9
         raise UmfError(
             f"{moment} is outside of {folder}: its keyframes are at 0 to {seconds:.1f} s, {first_ns} to {last_ns} ns"
         )
     row = min(range(len(about.run.stamps)), key=lambda row: abs(int(about.run.stamps[row]) - asked_ns))
-    _tell(Console(), about, row, explain(about, row))
+    _tell(console, about, row, explain(about, row))
 
 
-def _stamp(text: str, start_ns: int) -> int:
+def _moment(text: str) -> int | float:
     from umf_ros.lab.evaluation.place_views import parse_moment
 
     try:
-        moment = parse_moment(text)
+        return parse_moment(text)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
-    return moment if isinstance(moment, int) else start_ns + round(moment * 1e9)
+
+
+def _list(console: Console, about: JudgedRun) -> None:
+    """Print the stages that rejected keyframes, those with most of them first, and some of the keyframes of each."""
+    from rich.markup import escape
+
+    from umf_ros.core.errors import command_line
+    from umf_ros.core.geometry import evenly
+    from umf_ros.runs.diagnosis import explain
+
+    stages: dict[str, list[ClosureDiagnosis]] = {}
+    for row in range(len(about.run.stamps)):
+        if (found := explain(about, row)).gate != "found":
+            stages.setdefault(found.gate, []).append(found)
+    first_ns, lost = int(about.run.stamps[0]), sum(map(len, stages.values()))
+    missed = f"; {len(about.missed)} of them revisits by the truth" if about.covered[0] else ""
+    console.print(f"{lost} of {len(about.run.stamps)} keyframes closed no loop{missed}", highlight=False)
+    losses_first = sorted(stages.items(), key=lambda one: (one[0] == "gap rules", -len(one[1])))
+    for gate, all_found in losses_first:
+        moments = [
+            f"{(one.stamp_ns - first_ns) * 1e-9:.1f}" for one in (all_found[i] for i in evenly(len(all_found), SHOWN))
+        ]
+        at = f"at {', '.join(moments)} s" if len(moments) == len(all_found) else f"such as at {', '.join(moments)} s"
+        console.print(f"  [bold]{escape(gate)}[/]: {len(all_found)}, {at}", highlight=False, soft_wrap=True)
+    if lost:
+        example = losses_first[0][1][-1]
+        command = command_line("why", about.run.folder, f"{(example.stamp_ns - first_ns) * 1e-9:.1f}")
+        console.print(f"one of them in full: {command}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -> None:
     from rich.markup import escape
     from rich.table import Table
+
+    from umf_ros.core.errors import command_line
+    from umf_ros.verification.hypothesis import RejectReason
 
     start = int(about.run.stamps[0])
 
@@ -145,7 +201,8 @@ def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -
         say(f"would accept it: {escape(through)}")
     if tested := about.tested[why.stamp_ns]:
         table = Table("returned", "similarity", "probability", "m by the truth", "reason", box=None, pad_edge=False)
-        for one in tested[:SHOWN]:
+        compared = [one for one in tested if one.reason is not RejectReason.NOT_COMPARED]
+        for one in compared[:SHOWN]:
             apart_m = about.distance(*one.endpoints)
             probability = "" if one.probability is None else f"{one.probability:.3f}"
             known = f"{apart_m:.1f}" if apart_m < float("inf") else ""
@@ -153,10 +210,12 @@ def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -
                 at(one.match_stamp_ns), f"{one.candidate.similarity:.3f}", probability, known, escape(one.outcome)
             )
         console.print(table)
+        if others := len(tested) - len(compared):
+            say(f"{others} more: {RejectReason.NOT_COMPARED.value}")
     for name, value in sorted(why.contributions.items(), key=lambda one: -abs(one[1]))[:SHOWN]:
         say(f"  {name.replace('_', ' '):24} {value:+.1f}")
     if why.match_stamp_ns is not None:
-        say(f"picture: umf explain BAG {why.stamp_ns} {why.match_stamp_ns}")
+        say(f"picture: {escape(command_line('explain', about.run.folder, why.stamp_ns, why.match_stamp_ns))}")
 
 
 def recover_run(folder: Path) -> bool:

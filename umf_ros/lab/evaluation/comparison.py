@@ -16,7 +16,7 @@ from umf_ros.core.geometry import transform
 from umf_ros.lab.evaluation.place_views import PlaceView, Seen, ViewReader, split_reference
 from umf_ros.lab.scan_files import SensorFileError
 from umf_ros.runs.run_file import pose_numbers
-from umf_ros.verification import Hypothesis, Verifier
+from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import load_acceptance
 from umf_ros.verification.pose_search import consistent_pixels
@@ -197,7 +197,8 @@ class Explanation:
     def verdict(self) -> str:
         """One line for a person."""
         if self.best is None:
-            return "rejected: no pose fits"
+            known = any(keyframe.has_depth for keyframe in (self.query, self.match))
+            return f"rejected: {RejectReason.NO_POSE.value if known else NO_DEPTH}"
         probability = self.best.probability or 0.0
         word = "accepted" if probability >= self.threshold else "rejected"
         return f"{word}: probability {probability:.3f}, {self.threshold:g} is needed"
@@ -223,12 +224,20 @@ def draw(explanation: Explanation, query_image: Image | None, match_image: Image
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15, 11), layout="constrained")
-    grid = figure.add_gridspec(2, 3, height_ratios=[1.0, 1.05], width_ratios=[1.1, 1, 0.9])
-    _draw_images(figure.add_subplot(grid[0, :]), explanation, query_image, match_image)
-    _draw_scans(figure.add_subplot(grid[1, 0]), explanation, 1, "left [m]", "from above")
-    _draw_scans(figure.add_subplot(grid[1, 1]), explanation, 2, "up [m]", "from the side")
-    _draw_contributions(figure.add_subplot(grid[1, 2]), explanation)
+    has_scans = any(len(one.points) for one in (explanation.query, explanation.match))
+    has_images = any(image is not None for image in (query_image, match_image))
+    is_judged = bool(explanation.contributions)
+    rows = has_images + (has_scans or is_judged) or 1
+    figure = Figure(figsize=(15, 0.8 + 5.1 * rows), layout="constrained")
+    parts = figure.add_gridspec(rows, 1)
+    if has_images:
+        _draw_images(figure.add_subplot(parts[0]), explanation, query_image, match_image)
+    below = parts[-1].subgridspec(1, max(2 * has_scans + is_judged, 1))
+    if has_scans:
+        _draw_scans(figure.add_subplot(below[0]), explanation, 1, "left [m]", "from above")
+        _draw_scans(figure.add_subplot(below[1]), explanation, 2, "up [m]", "from the side")
+    if is_judged:
+        _draw_contributions(figure.add_subplot(below[-1]), explanation)
     stamps = f"query {explanation.query.stamp_ns}   match {explanation.match.stamp_ns}"
     figure.suptitle(f"{explanation.verdict}\n{stamps}", fontsize=14)
     with writing(path, ValueError):
@@ -243,7 +252,7 @@ def _draw_images(axes: Any, explanation: Explanation, query: Image | None, match
     shown = explanation.pixels[:: max(1, len(explanation.pixels) // MOST_LINES)]
     for u, v, match_u, match_v in shown:
         axes.plot([u, match_u + left.shape[1]], [v, match_v], color="limegreen", linewidth=0.7, alpha=0.8)
-    axes.set_title(f"query | match: {len(explanation.pixels)} feature pairs obey the pose")
+    axes.set_title(f"query | match: {len(shown)} of {len(explanation.pixels)} image features that agree with the pose")
     axes.set_axis_off()
 
 
@@ -265,6 +274,4 @@ def _draw_contributions(axes: Any, explanation: Explanation) -> None:
     colours = ["tab:red" if value < 0 else "tab:green" for value in values]
     axes.barh([name.replace("_", " ") for name in names], values, color=colours)
     axes.axvline(0, color="black", linewidth=0.8)
-    axes.set(
-        xlabel="log-odds", title=f"what speaks for it: {sum(values):+.1f} in all" if values else "nothing to judge"
-    )
+    axes.set(xlabel="log-odds", title=f"what speaks for it: {sum(values):+.1f} in all")

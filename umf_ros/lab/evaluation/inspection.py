@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.inputs import Advice
+from umf_ros.bags.inputs import Advice, absent_inputs, input_counts, present_topics, useless_inputs
 from umf_ros.bags.presets import detect_dataset, settings_for
 from umf_ros.bags.reader import Bag, decode
-from umf_ros.core.config import Settings, Topics, load_preset, topics_of
-from umf_ros.core.errors import BagError, MessageError, UmfError, either, printable
+from umf_ros.core.config import AUTO, ParameterSource, Settings, Topics, load_preset, load_settings
+from umf_ros.core.errors import BagError, MessageError, UmfError, command_line, either, printable
 from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
 from umf_ros.core.trajectory import Trajectory, bracket
@@ -28,6 +29,8 @@ from umf_ros.sensors.topic_finder import find_topics
 
 SAMPLES = 20
 """Messages of a topic that are decoded."""
+FRAMES = 20
+"""First frames that are read as a replay reads them."""
 FEW_PAIRS = 0.5
 """Share of the scans with an image, by hand, below which something is wrong."""
 
@@ -43,49 +46,70 @@ class Inspected:
     """Findings about a recording.
 
     Attributes:
-        topics: that would be used.
+        settings: that a replay would have, or that those of a parameter file by `umf inspect --write` would be.
+        topics: those of its inputs that the recording has; empty for others.
+        ambiguous: topics of inputs for which several fit, and no parameter names one.
+        unknown: why a replay needs such a file; empty where it does without.
         found: words about each input, by its name in `Topics`, and about `pairs` of scan and image.
-        messages: the first usable one of each input, by its name in `Topics`.
+        messages: the first usable one of each input, by its name in `Topics`; of the first topic where several fit.
         advice: what is wrong or missing, with what helps.
-        settings: that would be used without --config; None where the recording is of no known data set.
-        unknown: why it is of none.
     """
 
+    settings: Settings
     topics: Topics
+    ambiguous: dict[str, list[str]] = field(default_factory=dict)
+    unknown: str = ""
     found: dict[str, str] = field(default_factory=dict)
     messages: dict[str, Any] = field(default_factory=dict)
     advice: list[Advice] = field(default_factory=list)
-    settings: Settings | None = None
-    unknown: str = ""
 
     @property
-    def works(self) -> bool:
-        """Whether a replay can find anything."""
-        return not any(one.severity == "fault" for one in self.advice)
+    def fault(self) -> str:
+        """Why no replay can find anything; empty where one can."""
+        return next((one.what for one in self.advice if one.severity == "fault"), "")
 
 
-def inspect(bag: Bag) -> Inspected:
-    """Look at a recording: topics to use, the first messages of each, how they pair, and what excludes everything."""
-    topics, ambiguous = find_topics(bag.types)
-    found = Inspected(topics)
-    try:
-        found.settings = settings_for(bag, None, "auto")
-        named = {name: topic for name, topic in topics_of(found.settings).model_dump().items() if topic in bag.types}
-        found.topics = topics.model_copy(update=named)
-    except UmfError as error:
-        found.unknown = str(error)
-    for name in ambiguous if found.settings is None else ():
-        what = f"several topics fit {name}: {either(ambiguous[name])}"
-        found.advice.append(Advice("fault", what, f"topics.{name} names one"))
+def inspect(bag: Bag, source: ParameterSource = None, for_file: bool = False) -> Inspected:
+    """Look at a recording as a replay with these parameters would: its topics, their messages, and the first frames.
+
+    `for_file` takes topics by their type also where the recording lacks those of its data set, to write them.
+
+    Raises:
+        ConfigError: the parameters are wrong.
+    """
+    found = _settings_of(bag, source)
+    if for_file:
+        by_type = find_topics(bag.types)[0].model_dump().items()
+        lacking = {name: topic for name, topic in by_type if not getattr(found.topics, name)}
+        found.topics = found.topics.model_copy(update=lacking)
+    for name, fits in found.ambiguous.items():
+        command = command_line("inspect", bag.path, "--set", f"topics.{name}={fits[0]}")
+        found.advice.append(Advice("fault", f"several topics fit {name}: {either(fits)}", f"name one: {command}"))
     _read_samples(bag, found)
-    for rule in (_about_depth, _about_odometry, _about_pairs, _about_gaps):
+    for rule in (_about_inputs, _about_frames, _about_odometry, _about_pairs, _about_gaps):
         found.advice += rule(bag, found)
     return found
 
 
+def _settings_of(bag: Bag, source: ParameterSource) -> Inspected:
+    """Return the settings and topics of a replay, or those that a first parameter file would have."""
+    settings, unknown = load_settings(source), ""
+    named, (by_type, several) = settings.topics.model_fields_set, find_topics(bag.types)
+    try:
+        settings, several = settings_for(bag, source, AUTO), {}
+    except UmfError as error:
+        own = {name: getattr(settings.topics, name) for name in named}
+        several = {name: fits for name, fits in several.items() if name not in named}
+        settings, unknown = settings.model_copy(update={"topics": by_type.model_copy(update=own)}), str(error)
+        if not several and not isinstance(error, BagError):
+            raise
+    return Inspected(settings, present_topics(bag, settings), several, unknown)
+
+
 def _read_samples(bag: Bag, found: Inspected) -> None:
     """Decode the first messages of each input and tell what they are."""
-    names = {topic: name for name, topic in found.topics.model_dump().items() if topic}
+    topics = found.topics.model_dump() | {name: fits[0] for name, fits in found.ambiguous.items()}
+    names = {topic: name for name, topic in topics.items() if topic}
     left: dict[str, int] = dict.fromkeys(names, SAMPLES)
     faults: dict[str, str] = {}
     for raw in bag.raw_messages(list(names)):
@@ -146,19 +170,32 @@ _DESCRIBE: dict[str, Any] = {
 }
 
 
-def _about_depth(_: Bag, found: Inspected) -> Iterator[Advice]:
+def _about_inputs(bag: Bag, found: Inspected) -> Iterator[Advice]:
     topics = found.topics
-    if not topics.left_image and not topics.cloud:
+    if not topics.left_image and not topics.cloud and not found.ambiguous:
         yield Advice("fault", "neither images nor scans", "nothing to recognise a place by")
-    elif not topics.cloud and not topics.right_image:
-        what = "one camera without a LiDAR or a second camera: places are recognised, but no closure is metric"
-        yield Advice("fault", what, "record scans or a stereo pair")
-    elif not topics.cloud:
-        yield Advice("warning", "no scans: everything rests on the stereo pair")
-    elif not topics.left_image:
-        yield Advice("warning", "no images: everything rests on the scans")
-    if topics.left_image and not topics.left_info:
+    elif not topics.left_image and "left_image" not in found.ambiguous:
+        yield Advice("note", "no images: everything rests on the scans")
+    yield from absent_inputs(bag, found.settings, odometry_from_file=True)
+    if topics.left_image and not topics.left_info and found.unknown:
         yield Advice("note", "no camera_info: the calibration must say the intrinsics")
+
+
+def _about_frames(bag: Bag, found: Inspected) -> Iterator[Advice]:
+    """Read the first frames as a replay does, which tells what it would say."""
+    if found.unknown or not (found.topics.left_image or found.topics.cloud):
+        return
+    told: list[str] = []
+    try:
+        reader = FrameReader(bag, found.settings, warn=told.append)
+        frames = list(islice(reader, FRAMES))
+    except UmfError as error:
+        yield Advice("fault", str(error))
+        return
+    yield from (Advice("warning", text) for text in told if text != bag.warning)
+    has_depth = any(one.points is not None or (one.left is not None and one.right is not None) for one in frames)
+    for one in useless_inputs(input_counts(reader.counters)):
+        yield replace(one, severity="warning") if has_depth else one
 
 
 def _about_odometry(bag: Bag, found: Inspected) -> Iterator[Advice]:
@@ -175,7 +212,7 @@ def _about_odometry(bag: Bag, found: Inspected) -> Iterator[Advice]:
 
 def _about_pairs(bag: Bag, found: Inspected) -> Iterator[Advice]:
     """How many scans will have an image, by their stamps alone."""
-    topics, slop_s = found.topics, (found.settings or Settings()).sync.slop_s
+    topics, slop_s = found.topics, found.settings.sync.slop_s
     if not topics.left_image or not topics.cloud:
         return
     stamps: dict[str, list[int]] = {topics.left_image: [], topics.cloud: []}
@@ -195,7 +232,7 @@ def _about_pairs(bag: Bag, found: Inspected) -> Iterator[Advice]:
 
 
 def _about_gaps(bag: Bag, found: Inspected) -> Iterator[Advice]:
-    settings = found.settings or Settings()
+    settings = found.settings
     if bag.duration_s < settings.loop.min_time_gap_s:
         gap = f"loop.min_time_gap_s, {settings.loop.min_time_gap_s:g} s"
         what = f"{bag.duration_s:.1f} s are shorter than {gap}: no match is allowed"
@@ -204,13 +241,15 @@ def _about_gaps(bag: Bag, found: Inspected) -> Iterator[Advice]:
 
 
 def write_settings(found: Inspected, calibration: str) -> str:
-    """A first parameter file: the topics, and the calibration beside it."""
+    """A first parameter file: the topics, and the calibration beside it; an input without a topic is left out by ""."""
     defaults = Topics().model_dump()
     lines = ["# What umf inspect found; docs/parameters.md lists everything that may stand here.", "/**:"]
     lines += ["  ros__parameters:", f"    calibration: {calibration}", "    topics:"]
-    lines += [
-        f'      {name}: "{topic}"' for name, topic in found.topics.model_dump().items() if topic or defaults[name]
-    ]
+    for name, topic in found.topics.model_dump().items():
+        if name in found.ambiguous:
+            lines.append(f"      # {name}: one of {', '.join(found.ambiguous[name])}")
+        elif topic or defaults[name]:
+            lines.append(f'      {name}: "{topic}"')
     return "\n".join(lines) + "\n"
 
 
@@ -226,17 +265,21 @@ def calibration_of_dataset(found: Inspected, bag: Bag) -> Path | None:
 
 
 def write_calibration(found: Inspected, transforms: StaticTransforms) -> str:
-    """A first calibration: intrinsics of the camera_info, mountings of /tf_static, and what has to be measured."""
+    """A first calibration: intrinsics of the camera_info, mountings of /tf_static, and what has to be measured.
+
+    It has entries of the sensors that the recording has.
+    """
     lines = ["# Written by umf inspect. Metres, quaternions x y z w; poses in the body frame (x ahead, y left, z up)."]
-    lines += _camera_lines(found)
     frames = {name: printable(message.header.frame_id) for name, message in found.messages.items()}
     named = [frames[name] for name in ("cloud", "left_image") if frames.get(name)]
     bodies = [body for frame in named for body in BODIES if transforms.find(body, frame) is not None]
     body = bodies[0] if bodies else ""
     for key, name, usual in (("body_T_camera", "left_image", OPTICAL), ("body_T_lidar", "cloud", np.eye(4))):
-        frame = frames.get(name, "")
-        known = transforms.find(body, frame) if body and frame else None
-        note = f"of {frame} in {body}, from {TOPIC}" if known is not None else GUESS
+        if name not in frames:
+            continue
+        lines += _camera_lines(found) if name == "left_image" else []
+        known = transforms.find(body, frames[name]) if body and frames[name] else None
+        note = f"of {frames[name]} in {body}, from {TOPIC}" if known is not None else GUESS
         lines += _pose_lines(key, usual if known is None else known, note)
     lines += _pose_lines("body_T_imu", np.eye(4), "only for --odometry-frame imu")
     lines += ["lidar_time_offset_s: 0.0  # from a scan's stamp to the moment its points are brought to"]
@@ -247,8 +290,7 @@ def write_calibration(found: Inspected, transforms: StaticTransforms) -> str:
 def _camera_lines(found: Inspected) -> list[str]:
     left, right = (found.messages.get(name) for name in ("left_info", "right_info"))
     if left is None:
-        image = found.messages.get("left_image")
-        height, width = (480, 640) if image is None else decode_image(image).shape
+        height, width = decode_image(found.messages["left_image"]).shape
         focal = 0.8 * width
         numbers = {"width": width, "height": height, "fx": focal, "fy": focal, "cx": width / 2, "cy": height / 2}
         return [f"camera:  # {GUESS}", *_mapping(numbers | {"baseline": 0.0})]

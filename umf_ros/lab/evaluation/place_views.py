@@ -12,7 +12,7 @@ from pathlib import Path
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
-from umf_ros.core.config import KeyframePolicy
+from umf_ros.core.config import KeyframePolicy, ParameterSource
 from umf_ros.core.errors import BagError, UmfError
 from umf_ros.core.frames import Frame, Keyframe
 from umf_ros.detector import NOT_EMBEDDED, KeyframeSelector, assemble, make_keyframe
@@ -100,7 +100,7 @@ class ViewReader:
         embedder: Embedder,
         calibration: Path | None = None,
         bin_columns: int = 0,
-        config: Path | None = None,
+        config: ParameterSource = None,
         dataset: str = "auto",
         warn: Callable[[str], None] = lambda _: None,
         method: str = "",

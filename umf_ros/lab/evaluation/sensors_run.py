@@ -17,6 +17,7 @@ from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
+from umf_ros.core.config import ParameterSource
 from umf_ros.core.errors import UmfError
 from umf_ros.core.tasks import spread
 from umf_ros.detector import LoopDetector, make_detector_embedder
@@ -86,7 +87,7 @@ class SensorTask:
 
     name: str
     bag: Path
-    config: Path | None
+    config: ParameterSource
     folder: Path
     report: bool
 
@@ -105,7 +106,7 @@ def stretches_of(bag: Path) -> list[Stretch]:
 
 
 def replay_all(
-    bag: Path, config: Path | None, folder: Path, report: bool, workers: int, done: Callable[[int], None]
+    bag: Path, config: ParameterSource, folder: Path, report: bool, workers: int, done: Callable[[int], None]
 ) -> dict[str, JudgedRun]:
     """Replay a recording with both sensors and with each alone; the runs by name, each judged by the truth.
 
