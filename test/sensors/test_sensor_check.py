@@ -146,7 +146,7 @@ def test_impossible_axes_are_found_on_the_first_metres(
             break
     (found,) = check.contradictions
     assert found.subject == subject and words in found.what, found
-    assert ("quaternion x y z w" in found.remedy) == (subject != "odometry" and "mounting" in found.what)
+    assert ("quaternion: [" in found.remedy) == (subject != "odometry" and "mounting" in found.what)
 
 
 def test_the_quaternion_to_paste_is_the_mounting_that_is_right(drive: Drive) -> None:

@@ -268,7 +268,7 @@ def test_lenses_that_cannot_be_rectified_are_named(tmp_path: Path, models: tuple
 def test_an_imported_recording_is_of_no_known_data_set_and_never_overwritten(tmp_path: Path) -> None:
     """Its calibration may have been measured meanwhile."""
     imported("folder", tmp_path)
-    assert "no topic of a known data set" in umf("inspect", tmp_path / "made.mcap").text
+    assert "no topic of a known data set" in umf("replay", tmp_path / "made.mcap", "--out", tmp_path).text
     assert "calibration names a file" in only_line(umf("replay", tmp_path / "made.mcap", "--out", tmp_path / "out"))
     (tmp_path / "made.mcap").unlink()
     (tmp_path / "made.calibration.yaml").write_text("measured")
