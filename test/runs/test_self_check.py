@@ -6,6 +6,7 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+import pytest
 from command_line import umf
 from graph_worlds import LAP, SETTINGS, two_laps
 from graph_worlds import closing as closing_loops
@@ -13,6 +14,7 @@ from graph_worlds import closing as closing_loops
 from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import dump_settings, load_settings
 from umf_ros.core.geometry import invert, quantize, transform
+from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.lab.simulation.pose_graphs import GraphWorld, rover_loops, with_wrong_closures
 from umf_ros.pose_graph.sessions import Sessions
 from umf_ros.runs.run_file import SCAN_UNIT_M, Picture, RunFile, closure_row, read_table
@@ -74,12 +76,16 @@ def test_a_run_without_closures_has_nothing_to_judge() -> None:
     assert found.sentence == "no closures to judge" and not found.doubted and np.isnan(found.precision).all()
 
 
-def test_the_command_prints_precision_and_doubts_and_writes_a_table(tmp_path: Path) -> None:
+@pytest.mark.parametrize("live", [False, True])
+def test_the_command_prints_precision_and_doubts_and_writes_a_table(tmp_path: Path, live: bool) -> None:
     world = closing_loops(two_laps(), [(k, k + LAP) for k in range(0, 60, 4)], noise=0.1)
     world = closing_loops(world, [(30, 30 + LAP)], shift_m=(4.0, 0.0, 0.0))
     (tmp_path / "config.yaml").write_text(dump_settings(load_settings()))
     with closing(RunFile(tmp_path)) as file:
-        for row, pose in enumerate(world.odometry):
+        if live:  # the back-end exports it at the end
+            stamps_ns = np.arange(len(world.odometry)) * 10**9
+            write_tum(tmp_path / "trajectory_odometry.tum", Trajectory(stamps_ns, np.stack(list(world.odometry))))
+        for row, pose in enumerate(() if live else world.odometry):
             file.append_odometry(OdometrySample(row * 10**9, pose))
         with file.writing():
             file.append("closures", [closure_row(world.message(row), 0.9) for row in range(len(world.closures))])

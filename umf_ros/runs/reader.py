@@ -85,8 +85,8 @@ def read_run(folder: Path, bag: Bag | None = None, truth: Trajectory | None = No
         keyframes=run_file.read_keyframes(folder / "keyframes.csv"),
         candidates=run_file.read_table(folder / "candidates.csv", run_file.parse_candidate),
         verdicts=run_file.read_verdicts(folder / "graph_verdicts.csv", closures),
-        odometry=_trajectory(folder / "trajectory_odometry.tum"),
-        optimized=_trajectory(folder / "trajectory_optimized.tum"),
+        odometry=read_trajectory(folder / "trajectory_odometry.tum"),
+        optimized=read_trajectory(folder / "trajectory_optimized.tum"),
         truth=truth,
     )
     if bag is not None:
@@ -125,5 +125,6 @@ def _check_recording(run: FinishedRun, bag: Bag) -> None:
         )
 
 
-def _trajectory(path: Path) -> Trajectory | None:
+def read_trajectory(path: Path) -> Trajectory | None:
+    """Return the trajectory of a file; None if there is no file, or nothing in it."""
     return read_tum(path) if path.is_file() and path.stat().st_size else None

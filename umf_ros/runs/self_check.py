@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ from umf_ros.core.io import write_table
 from umf_ros.pose_graph.closures import Closures, PlacedClosure, as_closures
 from umf_ros.pose_graph.consistency import loops_between, paths_between, squared_mahalanobis
 from umf_ros.pose_graph.sessions import Sessions
+from umf_ros.runs.reader import read_trajectory
 from umf_ros.runs.run_file import NAME, SCAN_UNIT_M, RunFile
 from umf_ros.scan._kernels import KdTree
 from umf_ros.sensors.sessions import OdometrySessionSplitter
@@ -132,15 +133,13 @@ def check_run(folder: Path) -> SelfCheck:
     settings = load_settings(folder / "config.yaml").pose_graph
     with closing(RunFile(folder, read_only=True)) as file:
         sessions = Sessions(settings, AbsoluteReference(settings))
-
-        def add(stamp_ns: int, odom_T_body: Array) -> bool:
-            sessions.chains[-1].add(stamp_ns, odom_T_body)
-            return True
-
-        taker: Any = SimpleNamespace(begin_session=sessions.begin, add_odometry=add)
-        splitter = OdometrySessionSplitter(taker)
-        for one in file.odometry():
-            splitter.take(one.stamp_ns, one.odom_T_body)
+        take: Any = lambda *sample: sessions.chains[-1].add(*sample)  # noqa: E731 - into the newest session
+        splitter = OdometrySessionSplitter(cast(Any, SimpleNamespace(begin_session=sessions.begin, add_odometry=take)))
+        samples = [(one.stamp_ns, one.odom_T_body) for one in file.odometry()]
+        if not samples and (path := read_trajectory(folder / "trajectory_odometry.tum")):  # live, the back-end keeps it
+            samples = list(zip(path.stamps_ns.tolist(), path.poses, strict=True))
+        for stamp_ns, odom_T_body in samples:
+            splitter.take(stamp_ns, odom_T_body)
         splitter.finish()
         scans = {one.stamp_ns: one.scan.astype(np.float32) * SCAN_UNIT_M for one in file.pictures()}
         return judge(sessions, file.closures(), scans, settings)
