@@ -20,7 +20,7 @@ from umf_ros.core.geometry import make_pose
 from umf_ros.core.resources import ODOMETRY_ENGINES
 from umf_ros.lab.simulation.scenes import yard_scan
 from umf_ros.nodes.conversions import to_cloud, to_header
-from umf_ros.nodes.parameters import MADE_ODOMETRY, with_own_odometry
+from umf_ros.nodes.parameters import OWN_ODOMETRY, with_own_odometry
 from umf_ros.sensors.decode import decode_pose
 
 MODULE = "umf_ros.nodes.loop_closure_node"
@@ -45,7 +45,7 @@ def test_scans_become_odometry_for_both_nodes_and_no_transform(rover: Node, tmp_
     (tmp_path / "rig.yaml").write_text(CALIBRATION)
     heard = list[Odometry]()
     clouds = rover.create_publisher(PointCloud2, "/points", 10)
-    rover.create_subscription(Odometry, f"/{MADE_ODOMETRY}", heard.append, qos_profile_sensor_data)
+    rover.create_subscription(Odometry, f"/{OWN_ODOMETRY}", heard.append, qos_profile_sensor_data)
     empty = [f"topics.{name}:=''" for name in ("left_image", "right_image", "left_info", "right_info")]
     chosen = ["odometry.engine:=vgicp", "topics.cloud:=/points", "embedding.method:=solid", *empty]
     chosen += [f"calibration:={tmp_path / 'rig.yaml'}", "frames.extrinsics:=calibration", "qos.reliability:=reliable"]
@@ -53,7 +53,7 @@ def test_scans_become_odometry_for_both_nodes_and_no_transform(rover: Node, tmp_
     process.wait_for("ready")
     graph = Process("umf_ros.nodes.pose_graph_node", tmp_path / "graph.log", "odometry.engine:=vgicp")
     graph.wait_for("ready")
-    names = rover.get_subscriptions_info_by_topic(f"/{MADE_ODOMETRY}")
+    names = rover.get_subscriptions_info_by_topic(f"/{OWN_ODOMETRY}")
     assert {"loop_closure_node", "pose_graph_node"} <= {one.node_name for one in names}
     assert wait_until(lambda: bool(clouds.get_subscription_count()), 30.0)
     for step in range(30):  # at rest, then at 1 m/s
@@ -69,6 +69,6 @@ def test_scans_become_odometry_for_both_nodes_and_no_transform(rover: Node, tmp_
 
 
 def test_engine_and_topic_of_the_odometry_are_not_both_named() -> None:
-    assert with_own_odometry(load_settings(odometry__engine=ODOMETRY_ENGINES[0])).topics.odometry == MADE_ODOMETRY
+    assert with_own_odometry(load_settings(odometry__engine=ODOMETRY_ENGINES[0])).topics.odometry == OWN_ODOMETRY
     with pytest.raises(ConfigError, match=r"leave one of them"):
         with_own_odometry(load_settings(odometry__engine="vgicp", topics__odometry="/wheels"))

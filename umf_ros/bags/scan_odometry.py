@@ -15,13 +15,11 @@ from umf_ros.core.config import EmbeddingSettings, Settings, topics_of
 from umf_ros.core.errors import BagError
 from umf_ros.core.frames import Frame
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.sensors.scan_odometry import ENGINES, ScanOdometry
+from umf_ros.sensors.scan_odometry import ENGINES, FEWEST_POINTS, MAX_LOST, ScanOdometry
 
 OnScan = Callable[[float], None]
-MAX_LOST = 0.05
-"""Share of scans that may not fit the motion before them (*by hand*: .01 on good drives, .5 where track is lost)."""
-FIRST, FEWEST_POINTS = 5, 100
-"""Scans that tell the velocity at the start, and returns of a scan that is used."""
+FIRST = 5
+"""Scans that tell the velocity at the start."""
 
 
 def can_track(bag: Bag, settings: Settings) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -233,7 +234,8 @@ def import_cloud(
     lidar = clouds.VirtualLidar(fov, low, high, height_m=height)
     with Progress(console=console, transient=True) as bar:
         bar.add_task("Reading the cloud", total=None)
-        points = clouds.read_cloud(cloud)
+        read_points = import_module("umf_ros.lab.scan_files").read_points  # by name, as commands of the lab are
+        points = clouds.thinned(read_points(cloud), cloud)
         poses = clouds.along(read_tum(trajectory)) if trajectory else clouds.standing(points, height)
         headings = (0.0, 180.0) if trajectory else (0.0, 90.0, 180.0, 270.0)
         views, embedder = clouds.CloudViews(points, poses, headings, lidar), make_detector_embedder(settings)

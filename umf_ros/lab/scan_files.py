@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -35,6 +35,7 @@ class SensorFileError(UmfError):
 
 
 Columns = dict[str, NDArray[Any]]
+Taken = TypeVar("Taken")
 Record = np.dtype[Any]
 
 LARGEST_SCAN = 2**29
@@ -74,6 +75,21 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
     Raises:
         SensorFileError: the file cannot be read, is none of these, or holds no return; names it.
     """
+    columns, cloud = _read(path, lambda columns: (columns, real_returns(columns, columns)[0]), bin_columns)
+    if not len(cloud.points):
+        far = any(bool((np.abs(columns[axis]) > FURTHEST_RETURN_M).any()) for axis in "xyz")
+        raise SensorFileError(f"{path} has {OUT_OF_REACH}" if far else f"{path} holds no return")
+    return cloud
+
+
+def read_points(path: Path) -> NDArray[np.float64]:
+    """Read the points (N, 3) of the cloud of a map, however far they are; raises as `read_scan`."""
+    points = _read(path, lambda columns: np.column_stack([np.asarray(columns[axis], float) for axis in "xyz"]))
+    return points[np.isfinite(points).all(axis=1) & points.any(axis=1)]
+
+
+def _read(path: Path, take: Callable[[Columns], Taken], bin_columns: int = 0) -> Taken:
+    """Return what is taken from the columns of a file."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise SensorFileError(f"{path} is no scan: expected {either(SUFFIXES)}")
@@ -84,17 +100,13 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
         missing = [axis for axis in "xyz" if axis not in columns]
         if missing:
             raise SensorFileError(f"no field {', '.join(missing)}")
-        cloud, _ = real_returns(columns, columns)
+        return take(columns)
     except OSError as error:
         raise SensorFileError(f"cannot read {path}: {error.strerror}") from None
     except SensorFileError as error:
         raise SensorFileError(f"{path}: {error}") from None
     except Exception as error:  # damaged bytes provoke anything
         raise SensorFileError(f"{path} is damaged: {one_line(error)}") from None
-    if not len(cloud.points):
-        far = any(bool((np.abs(columns[axis]) > FURTHEST_RETURN_M).any()) for axis in "xyz")
-        raise SensorFileError(f"{path} has {OUT_OF_REACH}" if far else f"{path} holds no return")
-    return cloud
 
 
 def parse_pcd(content: bytes) -> Columns:

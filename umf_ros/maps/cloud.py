@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,21 +17,20 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.errors import UmfError, reading
-from umf_ros.core.frames import Frame, Keyframe, LoopClosure, ScanMotion, StereoCamera
+from umf_ros.core.errors import UmfError
+from umf_ros.core.frames import Frame, Keyframe, LoopClosure, ScanMotion
 from umf_ros.core.geometry import Array, first_of_cubes, interpolate, invert, make_pose, relative, transform
-from umf_ros.core.limits import check_size
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import make_keyframe
 from umf_ros.embedding import Embedder
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import Drive, add_drive
+from umf_ros.sensors.calibration import NO_CAMERA
 from umf_ros.sensors.decode import OdometrySample
 
 SPACING_M, CELL_M = 1.0, 2.0
 """Distance of places along a trajectory, and sides of the cells without one."""
 _START_NS, _SECOND_NS = 1_000_000_000 * 10**9, 10**9
-_NO_CAMERA = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)
 _EXACT = np.diag([0.01, 0.01, 0.01, 0.002, 0.002, 0.002]) ** 2
 # visibility: side of the cells of a depth image, deg, and by how much a point may lie behind the nearest, of its range
 # and in m; points are so sparse near the LiDAR that wider cells close the gaps between them
@@ -93,24 +91,12 @@ def _hidden(
     return np.asarray((away if own is None else own) > ratio * nearest + margin_m)
 
 
-def read_cloud(path: Path) -> Array:
-    """Read the points (N, 3) of a .pcd or .ply file, m, and keep one in every cube of 10 cm.
+def thinned(points: Array, path: Path) -> Array:
+    """Return one of the points (N, 3) of the cloud of a file in every cube of 10 cm.
 
     Raises:
-        UmfError: it is neither, is damaged, or holds no points.
+        UmfError: there are too few.
     """
-    files = import_module("umf_ros.lab.scan_files")  # by its name: nothing else of the runtime reads files of clouds
-    parsers = {".pcd": files.parse_pcd, ".ply": files.parse_ply}
-    if path.suffix.lower() not in parsers:
-        raise UmfError(f"{path} is no cloud: expected .pcd or .ply")
-    with reading(path, UmfError, "cannot be read as a cloud"):
-        check_size(path.stat().st_size, "it", files.LARGEST_SCAN)
-        try:
-            columns = parsers[path.suffix.lower()](path.read_bytes())
-        except files.SensorFileError as error:
-            raise UmfError(f"{path}: {error}") from None
-        points = np.column_stack([np.asarray(columns[axis], float) for axis in "xyz"])
-    points = points[np.isfinite(points).all(axis=1) & points.any(axis=1)]
     if len(points) < _FEWEST:
         raise UmfError(f"{path} holds {len(points)} points: too few for a map")
     return points[first_of_cubes(points, _THIN_M)]
@@ -246,7 +232,7 @@ def _place(views: CloudViews, embedder: Embedder, at: OdometrySample, path_m: fl
         return None
     frame = Frame(
         stamp_ns=at.stamp_ns,
-        camera=_NO_CAMERA,
+        camera=NO_CAMERA,
         body_T_camera=np.eye(4),
         body_T_lidar=np.eye(4),
         points=points,

@@ -80,7 +80,7 @@ class BaseNode(LifecycleNode, ABC):
         self._settings = with_own_odometry(self._settings)
         self._input_names, self._finder = wanted, None
         if must_find(self._settings, wanted):
-            self._check_results()  # before it waits for topics
+            _check_results(self._results)  # before it waits for topics
             self._finder = TopicFinder(self._settings, self.get_namespace(), wanted)
         self.failure: UmfError | None = None
         self._watches: list[InputWatch] = []
@@ -218,7 +218,7 @@ class BaseNode(LifecycleNode, ABC):
         """Work once per second of the machine's clock."""
 
     def _configure(self) -> None:
-        self._check_results()
+        _check_results(self._results)
         before, self._unwritten = self._entities(), None
         try:
             with watchdog.watching(watchdog.PATIENT_S), ExitStack() as self._opening:
@@ -231,10 +231,6 @@ class BaseNode(LifecycleNode, ABC):
             gc.freeze()
         finally:
             self._own = [item for item in self._entities() if item not in before]
-
-    def _check_results(self) -> None:
-        if self._results:
-            check_writable(Path(self._results))
 
     def _entities(self) -> list[Any]:
         return [*self.publishers, *self.subscriptions, *self.services]
@@ -451,22 +447,26 @@ class BaseNode(LifecycleNode, ABC):
             if self._opened:
                 self._retune(settings)
 
+    def _follow_initial_pose(self, take: Callable[[MapPoses, InitialPose], None]) -> MapPoses | None:
+        """Pass on the pose where the rover may be: of the parameter or the last run now, of rviz whenever it comes.
 
-def follow_initial_pose(node: BaseNode, take: Callable[[MapPoses, InitialPose], None]) -> MapPoses | None:
-    """Pass on the pose where the rover may be: of the parameter or the last run now, of rviz whenever it comes.
+        Returns:
+            The poses of the map; None while mapping.
+        """
+        settings = self._settings
+        if not settings.localizing:
+            return None
+        known = MapPoses(Path(settings.map))
+        if (initial := known.initial(settings, self._results)) is not None:
+            take(known, initial)
 
-    Returns:
-        The poses of the map; None while mapping.
-    """
-    settings = node._settings
-    if not settings.localizing:
-        return None
-    known = MapPoses(Path(settings.map))
-    if (initial := known.initial(settings, node._results)) is not None:
-        take(known, initial)
+        def receive(message: PoseWithCovarianceStamped) -> None:
+            take(known, known.from_message(message, settings.frames.map))
 
-    def receive(message: PoseWithCovarianceStamped) -> None:
-        take(known, known.from_message(message, settings.frames.map))
+        self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._guarded("initial pose", receive), 1)
+        return known
 
-    node.create_subscription(PoseWithCovarianceStamped, "initialpose", node._guarded("initial pose", receive), 1)
-    return known
+
+def _check_results(folder: str) -> None:
+    if folder:
+        check_writable(Path(folder))

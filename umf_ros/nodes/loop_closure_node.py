@@ -32,7 +32,7 @@ from umf_ros.core.io import memory_mb
 from umf_ros.detector import WITHHELD, Detection, LoopDetector, make_detector_embedder
 from umf_ros.map_poses import InitialPose, MapPoses, PoseHint
 from umf_ros.nodes import conversions as messages
-from umf_ros.nodes.base_node import BaseNode, follow_initial_pose
+from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, MAX_LINES, SCAN_FIELDS
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
@@ -41,6 +41,7 @@ from umf_ros.runs.run_file import as_stored
 from umf_ros.runs.writer import RunRecorder, count_drops, with_places
 from umf_ros.sensors.calibration import calibration_of
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
+from umf_ros.sensors.scan_odometry import MAX_LOST
 from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.verification import Hypothesis
 
@@ -53,8 +54,6 @@ DECODE_S = 0.5
 """Longest time at the end for waiting messages, and as long again for the one in hand."""
 RESUME = "played again into a node with the same results_dir and database.path, they continue the run"
 SCAN_DEPTH = 50
-MAX_LOST = 0.05
-"""Share of scans that may not fit the motion before them, as in a replay."""
 MESSAGE_TYPES = {"cloud": PointCloud2, "odometry": Odometry}
 MESSAGE_TYPES |= dict.fromkeys(("left_image", "right_image"), Image)
 MESSAGE_TYPES |= dict.fromkeys(("left_info", "right_info"), CameraInfo)
@@ -92,7 +91,7 @@ class LoopClosureNode(BaseNode):
         self._paused = self._ends_session = False
         self._wanted: Settings | None = None
         self._hint: Callable[[Keyframe], dict[int, Array]] | None = None
-        follow_initial_pose(self, self._expect)
+        self._follow_initial_pose(self._expect)
         self._closures = self._between = 0
         self._last: Detection | None = None
         self._worker: Worker[Frame] = Worker(self._detect, self._report_fault, settings.worker.queue_size)

@@ -20,7 +20,8 @@ from umf_ros.core.errors import ConfigError
 BUILT_IN = ("use_sim_time", "qos_overrides", "start_type_description_service")
 AUTOSTART = "configure and activate at once; false: wait for the services of the life cycle"
 SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
-MADE_ODOMETRY = "loop_closure_node/odometry"
+OWN_ODOMETRY = "loop_closure_node/odometry"
+"""Topic of the odometry that the front-end makes from the scans."""
 CHANGEABLE = (
     "loop.",
     "verification.min_probability",
@@ -90,7 +91,7 @@ def with_own_odometry(settings: Settings) -> Settings:
         return settings
     if settings.topics.odometry and "odometry" in settings.topics.model_fields_set:
         raise ConfigError("odometry.engine makes the odometry that topics.odometry names: leave one of them")
-    topics = settings.topics.model_copy(update={"odometry": MADE_ODOMETRY})
+    topics = settings.topics.model_copy(update={"odometry": OWN_ODOMETRY})
     return settings.model_copy(update={"topics": topics})
 
 

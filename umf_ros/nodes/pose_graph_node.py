@@ -31,7 +31,7 @@ from umf_ros.core.frames import LoopClosure
 from umf_ros.graph_process import JOURNAL, ProcessEndedError, start_graph
 from umf_ros.map_poses import InitialPose, MapPoses
 from umf_ros.nodes import conversions as messages
-from umf_ros.nodes.base_node import ODOMETRY_DEPTH, BaseNode, follow_initial_pose
+from umf_ros.nodes.base_node import ODOMETRY_DEPTH, BaseNode
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, parse_pair
 from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
@@ -94,7 +94,7 @@ class PoseGraphNode(BaseNode):
         self._worker: Worker[Callable[[], None]] = Worker(lambda step: step(), self._on_failure, AT_ONCE)
         self._newest: OdometrySample | None = None
         self._kept_at = np.full(3, np.inf)
-        self._map_poses = follow_initial_pose(self, self._expect)
+        self._map_poses = self._follow_initial_pose(self._expect)
         if self._state.unsettled:
             self._worker.submit(self._settle_previous, needed=True)
         is_aided = bool(settings.absolute.gnss or settings.absolute.imu)

@@ -18,14 +18,14 @@ from umf_ros.nodes.process import Worker
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
-from umf_ros.sensors.scan_odometry import ENGINES, ScanOdometry
+from umf_ros.sensors.scan_odometry import ENGINES, FEWEST_POINTS, ScanOdometry
 from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.sensors.tf import BodyFrames
 
 SCANS, LOST = "odometry_scans", "odometry_lost"
 """Counts: scans that were registered, and those among them that do not fit the motion before them."""
-WAITING, KEPT, FEWEST_POINTS = 10, 20, 100
-"""Scans that wait at most, poses that the engine is asked for again, and returns of a scan that is used."""
+WAITING, KEPT = 10, 20
+"""Scans that wait at most, and poses that the engine is asked for again."""
 
 
 def start_engine(

@@ -19,6 +19,9 @@ from umf_ros.sensors.decode import OdometrySample
 VOXEL_M, THINNED_M, RANGE_M, NEIGHBOURS = 0.5, 0.25, 80.0, 40
 """Voxels of the engine's map and of a scan, range of a scan, and points that a surface is fitted to: they have to reach
 the next ring of a LiDAR of 16 rings, or each ring would be a line that slides along itself."""
+MAX_LOST, FEWEST_POINTS = 0.05, 100
+"""Share of scans that may not fit the motion before them (*by hand*: .01 on good drives, .5 where track is lost), and
+returns of a scan that is used."""
 MAX_POINTS, MAX_ITERATIONS, SCANS_KEPT = 3000, 20, 100
 """Points and iterations of a registration; scans after which a voxel is forgotten that no point was matched with."""
 

@@ -10,16 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.commands.recordings import (
-    Changes,
-    ConfigPath,
-    DatasetName,
-    EmbedderName,
-    WeightsPath,
-    check_files,
-    open_recording,
-    parameters,
-)
+from umf_ros.commands import recordings as options
 from umf_ros.core.errors import BagError, ConfigError, OutputError, UmfError, one_line, writing
 
 if TYPE_CHECKING:
@@ -48,11 +39,11 @@ def command(
         int, typer.Option(min=0, max=64, help="Numbers per point of a .bin file; 0: 4, 5 or 3, by its data.")
     ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
-    config: ConfigPath = None,
-    changes: Changes = None,
-    dataset: DatasetName = "auto",
-    embedder: EmbedderName = None,
-    weights: WeightsPath = None,
+    config: options.ConfigPath = None,
+    changes: options.Changes = None,
+    dataset: options.DatasetName = "auto",
+    embedder: options.EmbedderName = None,
+    weights: options.WeightsPath = None,
 ) -> None:
     """Decide whether two views show the same place, and estimate their relative pose.
 
@@ -81,7 +72,7 @@ def command(
     else:
         asked = [(_view(match, match_left, match_right), _view(query, query_left, query_right))]
     method = {"embedding__method": embedder, "embedding__weights": str(weights) if weights else None}
-    source = parameters(config, changes)
+    source = options.parameters(config, changes)
     settings = load_settings(source, **method)
     errors = Console(stderr=True)
     views = ViewReader(
@@ -181,18 +172,18 @@ def explain(
     query: Annotated[str, typer.Argument(help="The later moment: stamp in ns, or seconds from the start.")],
     match: Annotated[str, typer.Argument(help="The earlier moment, in the same units.")],
     out: Annotated[Path | None, typer.Option(help="Picture to write; default: a new explanation.png.")] = None,
-    config: ConfigPath = None,
-    changes: Changes = None,
-    dataset: DatasetName = "auto",
-    embedder: EmbedderName = None,
-    weights: WeightsPath = None,
+    config: options.ConfigPath = None,
+    changes: options.Changes = None,
+    dataset: options.DatasetName = "auto",
+    embedder: options.EmbedderName = None,
+    weights: options.WeightsPath = None,
 ) -> None:
     """Draw both images with their matches, the aligned scans, and the numbers of the decision.
 
     A run folder stands for its recording, read with the parameters of the run.
     """
     moments = [_moment(text) for text in (query, match)]
-    check_files(source, config)
+    options.check_files(source, config)
 
     from rich.console import Console
 
@@ -200,31 +191,28 @@ def explain(
 
     console = Console()
     with waiting(console, "Looking for the two moments"):
+        import umf_ros.lab.evaluation.comparison as comparison
         from umf_ros.bags.frames import FrameReader
         from umf_ros.detector import make_detector_embedder, make_keyframe
-        from umf_ros.lab.evaluation.comparison import draw
-        from umf_ros.lab.evaluation.comparison import explain as explained
         from umf_ros.lab.evaluation.place_views import nearest_frames
 
         bag, config = _of_run(source, config) if (source / "summary.json").is_file() else (source, config)
-        recording, settings = open_recording(bag, parameters(config, changes), dataset, embedder, weights)
-        network = make_detector_embedder(settings)
-        frames = []
+        chosen = options.parameters(config, changes)
+        recording, settings = options.open_recording(bag, chosen, dataset, embedder, weights)
+        network, frames = make_detector_embedder(settings), []
         for one in nearest_frames(FrameReader(recording, settings), moments):
             if isinstance(one, BagError):
                 raise one
             frames.append(one)
         query_keyframe, match_keyframe = (make_keyframe(frame, network) for frame in frames)
-        explanation = explained(query_keyframe, match_keyframe, settings.verification)
+        explanation = comparison.explain(query_keyframe, match_keyframe, settings.verification)
         names = chain([Path("explanation.png")], (Path(f"explanation_{number}.png") for number in count(2)))
         picture = out or next(path for path in names if not path.exists())
-        draw(explanation, frames[0].left, frames[1].left, picture)
+        comparison.draw(explanation, frames[0].left, frames[1].left, picture)
     console.print(explanation.verdict, highlight=False)
     if explanation.best is not None:
-        agree = (
-            f"{len(explanation.pixels)} image features agree with the pose; inliers_image are those of its first guess"
-        )
-        console.print(f"  {agree}", highlight=False, soft_wrap=True)
+        text = f"  {len(explanation.pixels)} image features agree with the pose; inliers_image: with its first guess"
+        console.print(text, highlight=False, soft_wrap=True)
         for name, value in explanation.best.measurements.items():
             console.print(f"  {name:22} {value:.4g}", highlight=False)
     console.print(f"wrote {picture}", markup=False, highlight=False, soft_wrap=True)
