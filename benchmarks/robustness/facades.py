@@ -18,7 +18,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from levelling import weathered
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
@@ -29,14 +28,16 @@ from umf_ros.embedding import make_embedder
 from umf_ros.lab.evaluation.comparison import judge
 from umf_ros.lab.scan_files import make_snapshot
 from umf_ros.lab.simulation.domains.pairs import is_wrong
-from umf_ros.lab.simulation.domains.scanners import SCANNERS, sweep
+from umf_ros.lab.simulation.domains.scanners import SCANNERS, Sweep, sweep
 from umf_ros.lab.simulation.domains.solids import Solids
 from umf_ros.lab.simulation.domains.street import Facade
 from umf_ros.lab.simulation.world import TEST
+from umf_ros.sensors.decode import Cloud
 from umf_ros.verification import Verifier
 
 KINDS = "storeys", "piers", "ivy"
 STANDS, PRECISE_M = 5, 0.1
+DROPPED, FLYING = 0.15, 0.02  # shares of a scan
 
 
 def main(
@@ -86,6 +87,15 @@ def front(kind: str, solids: Solids, away_m: float, rng: np.random.Generator) ->
         place = [away_m - rng.uniform(0.2, 1.5), rng.uniform(-5, 5), rng.uniform(0.5, 4)]
         solids.leaves(rng.normal(0, 0.7, (150, 3)) + place, 0.2, rng)
     solids.box([0, 0, -1.1], [60, 60, 1.0])
+
+
+def weathered(scan: Sweep, rng: np.random.Generator) -> Cloud:
+    """A scan with dropouts and flying pixels."""
+    kept = rng.random(len(scan.points)) > DROPPED
+    points, intensity = scan.points[kept].copy(), None if scan.intensity is None else scan.intensity[kept]
+    flying = rng.random(len(points)) < FLYING
+    points[flying] *= rng.uniform(0.9, 1.1, (int(flying.sum()), 1)).astype(np.float32)
+    return Cloud(points, intensity)
 
 
 def _standing(pose: Array, _: Array) -> Array:

@@ -25,8 +25,11 @@ class KdTree:
         Of fewer points the last stands for the others, at an infinite distance.
         """
 
-    def normals(self, places: Array, neighbours: int) -> Array:
-        """Return unit normals (M, 3) at places (M, 3) towards the origin, zero where fewer than five are neighbours."""
+    def normals(self, places: Array, neighbours: int, width: float = 0.0) -> Array:
+        """Return unit normals (M, 3) at places (M, 3) towards the origin; zero where fewer than five are neighbours.
+
+        Likewise where these lie on a line: with less than `width` of the standard deviation along it across.
+        """
 
     def planes(self, neighbours: int) -> tuple[Array, Array, Array, Array]:
         """Return the planes through the neighbourhoods of the points.

@@ -44,7 +44,7 @@ def _cell_means(points: Points, values: Points) -> Points:
 
 
 class OrientedPoints(NamedTuple):
-    """Points (N, 3), m, with unit normals (N, 3) that their neighbours among themselves have."""
+    """Points (N, 3), m, with unit normals (N, 3) that their neighbours among themselves have; zero on a single ring."""
 
     points: Array
     normals: Array
@@ -53,7 +53,7 @@ class OrientedPoints(NamedTuple):
     def of(cls, points: Array) -> OrientedPoints:
         """Give points (N, 3) their normals."""
         points = np.ascontiguousarray(points)
-        return cls(points, kernels.KdTree(points).normals(points, 2 * const.NEIGHBOURS))
+        return cls(points, kernels.KdTree(points).normals(points, 2 * const.NEIGHBOURS, const.RING_WIDTH))
 
 
 @dataclass(frozen=True)
@@ -213,8 +213,8 @@ class PreparedScan:
 
     @cached_property
     def normals(self) -> Array:
-        """(M, 3) unit normals, zero where the neighbourhood is too small."""
-        return self.tree.normals(self.points, 2 * const.NEIGHBOURS)
+        """(M, 3) unit normals for the alignment, zero where the neighbours are too few or on a single ring."""
+        return self.tree.normals(self.points, 2 * const.NEIGHBOURS, const.RING_WIDTH)
 
     @cached_property
     def picks(self) -> Indices:
@@ -233,7 +233,7 @@ class PreparedScan:
 
     @cached_property
     def sample_normals(self) -> Array:
-        """(S, 3) `normals` of the sample alone."""
+        """(S, 3) unit normals of the sample, those on a single ring too."""
         return self.tree.normals(self.sample, 2 * const.NEIGHBOURS)
 
     @property
@@ -259,13 +259,16 @@ class PreparedScan:
         away = np.abs(np.einsum("nki,ni->nk", offsets, self.sample_normals))
         return 1.4826 * float(np.median(away))
 
+    def in_odd_band(self, rays: Array, owner: Indices) -> NDArray[np.bool_]:
+        """(N,) whether rays (N, 3), body frame, lie in an odd one of the bands of elevations of a merged scan (N,)."""
+        seen = np.einsum("nij,nj->ni", self._lidars_T_body[owner, :3, :3], rays)
+        elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
+        return np.asarray(np.floor(elevation / const.SIGHT_DEG) % 2 == 1)
+
     @cached_property
     def surfaces(self) -> tuple[Surfaces, Surfaces]:
         """Planes through the points of every second band of elevations, and through those between."""
-        poses = self._lidars_T_body[self.owner]
-        seen = np.einsum("nij,nj->ni", poses[:, :3, :3], self.points) + poses[:, :3, 3]
-        elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
-        odd = (np.floor(elevation / const.SIGHT_DEG) % 2).astype(bool)
+        odd = self.in_odd_band(self.points - self.lidars[self.owner], self.owner)
         return Surfaces.of(self.points[~odd]), Surfaces.of(self.points[odd])
 
     @cached_property

@@ -77,13 +77,13 @@ nb::tuple neighbours(const KdTree& tree, const Points& queries, int wanted) {
   return nb::make_tuple(index.of({count, width}), squared.of({count, width}));
 }
 
-nb::object normals(const KdTree& tree, const Points& places, int wanted) {
+nb::object normals(const KdTree& tree, const Points& places, int wanted, double width) {
   require(0 < wanted && wanted <= KdTree::kMostNeighbours, "1 to 32 neighbours");
   const size_t count = places.shape(0);
   Out<double> found(3 * count);
   {
     nb::gil_scoped_release free;
-    normals_at(tree, places.data(), count, wanted, found.data);
+    normals_at(tree, places.data(), count, wanted, width, found.data);
   }
   return nb::cast(found.of({count, 3}));
 }
@@ -224,7 +224,7 @@ NB_MODULE(_kernels, module) {
       .def("__len__", &KdTree::size)
       .def("nearest", &nearest, "queries"_a)
       .def("neighbours", &neighbours, "queries"_a, "count"_a)
-      .def("normals", &normals, "places"_a, "neighbours"_a)
+      .def("normals", &normals, "places"_a, "neighbours"_a, "width"_a = 0.0)
       .def("planes", &planes, "neighbours"_a);
   nb::class_<RangeImage>(module, "RangeImage")
       .def("__init__",
