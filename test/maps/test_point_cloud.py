@@ -53,9 +53,10 @@ def test_files_are_read_back_as_they_were(tmp_path: Path) -> None:
 
 def test_the_picture_shows_the_ground() -> None:
     heights = HeightMap(np.array([[0.0, 0.0], [10.0, 4.0]]))
-    assert heights.png() is None
+    assert heights.draw() is None
     heights.add(ground(0.0)["point"].astype(float))
-    png = heights.png()
-    assert png is not None and png.startswith(b"\x89PNG")
+    drawn = heights.draw()
+    assert drawn is not None and drawn[0].shape[2] == 4 and drawn[1][0] < drawn[1][1]
     heights.add(np.array([[1e6, 0, 0.0]]))  # far outside: left out
-    assert heights.png() == png
+    again = heights.draw()
+    assert again is not None and np.array_equal(again[0], drawn[0]) and again[1] == drawn[1]

@@ -18,6 +18,7 @@ from umf_ros.runs.run_file import SCAN_UNIT_M, Picture
 from umf_ros.runs.scene import build_scene, pairs_of
 from umf_ros.verification import RejectReason
 
+CHECKS = Path(__file__).with_name("page_checks.js")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 
@@ -45,8 +46,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def browse(page: Path, folder: Path, *options: str, pair: str = "") -> str:
     command = [str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}"]
     command += ["--virtual-time-budget=8000", "--hide-scrollbars", *options, f"file://{page}{pair}"]
-    done = subprocess.run(command, capture_output=True, encoding="utf-8", timeout=120, check=False)
-    return done.stdout
+    return subprocess.run(command, capture_output=True, encoding="utf-8", timeout=120, check=False).stdout
 
 
 def text_of(dom: str, name: str) -> str:
@@ -78,14 +78,15 @@ def test_an_address_leads_to_a_pair_and_its_reasons(page: Path, tmp_path: Path) 
 def test_it_fits_the_window_in_light_and_dark(page: Path, tmp_path: Path, width: int, dark: bool) -> None:
     """A frame of that width, for a browser's own window cannot be as narrow as a telephone."""
     frame = tmp_path / "frame.html"
-    script = "<script>onload = () => setTimeout(() => { const d = frames[0].document.documentElement;" \
-        "document.body.dataset.overflow = d.scrollWidth - d.clientWidth }, 3000)</script>"  # fmt: skip
+    style = f"style='border:0' width={width} height=4000"
     frame.write_text(
-        f"<body style='margin:0'><iframe style='border:0' width={width} height=4000 src='file://{page}'></iframe>{script}"
+        f"<body style='margin:0'><iframe {style} src='file://{page}'></iframe><script>{CHECKS.read_text()}</script>"
     )
     options = ["--allow-file-access-from-files", f"--window-size={max(width, 500)},4000"]
     options += [f"--blink-settings=preferredColorScheme={int(not dark)}"]
-    assert 'data-overflow="0"' in browse(frame, tmp_path, "--dump-dom", *options)
+    seen = dict(re.findall(r'data-(\w+)="([^"]*)"', browse(frame, tmp_path, "--dump-dom", *options)))
+    assert seen["overflow"] == "0" and (seen["table"] == "0" or width < 1280) and 20 < int(seen["head"]) < 120, seen
+    assert int(seen["texts"]) > 60 and float(seen["weakest"]) >= 4.5, seen  # WCAG 2.1, AA
     browse(frame, tmp_path, f"--screenshot={tmp_path / 'page.png'}", *options)
     picture = cv2.imread(str(tmp_path / "page.png"))
     corner = picture[200:3800:50, 3 : width - 3 : 40].reshape(-1, 3).mean(axis=1)

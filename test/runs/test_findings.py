@@ -33,8 +33,8 @@ def test_what_was_found_and_used_is_green(tmp_path: Path) -> None:
     assert verdict(about) == (
         "good",
         0,
-        "1 true and 0 false loop closures at 1 revisits, the graph used all of them; trajectory error 1.50 m by "
-        "odometry, 0.25 m optimised.",
+        "1 true and 0 false loop closures at 1 revisits, the graph used all of them; trajectory error (ATE, "
+        "rigidly aligned) 1.50 m by odometry, 0.25 m optimised.",
     )
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
+import html
 import io
 import json
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
-from finished_runs import accepted, candidate, closure, examined, trajectory
+from finished_runs import BELOW, accepted, candidate, closure, examined, trajectory
 from rich.console import Console
 
 from umf_ros.bags.inputs import Advice
@@ -20,33 +22,17 @@ from umf_ros.runs.report import closure_rows, final_verdicts, print_summary, wri
 from umf_ros.runs.scene import build_scene, pairs_of
 from umf_ros.runs.truth import JudgedRun
 from umf_ros.verification import RejectReason
+from umf_ros.verification.measurement import MEASUREMENTS
 
 NASTY = "</script><script>alert('x')</script> & \"quotes\" [red]"
 TRUTH = {"closures_true": 4, "closures_false": 0, "revisits": 3, "ate_odometry_m": 1.5, "ate_optimized_m": 0.25}
 TRUTH |= {"revisits_any_heading": 0, "closed_any_heading": 0, "nees_median": None, "inside_95": None}
 
 
-class Read(HTMLParser):
-    """The text that a browser shows outside of scripts, and how many scripts there are."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.text: list[str] = []
-        self.scripts = 0
-        self._inside = ""
-        self.feed(page)
-        self.close()
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self._inside = tag
-        self.scripts += tag == "script"
-
-    def handle_endtag(self, tag: str) -> None:
-        self._inside = ""
-
-    def handle_data(self, data: str) -> None:
-        if self._inside not in ("script", "style") and data.strip():
-            self.text.append(data.strip())
+def shown(page: str) -> list[str]:
+    """The texts that a browser shows."""
+    texts = re.split(r"<[^>]*>", re.sub(r"(?s)<(script|style)\b.*?</\1>", "", page))
+    return [html.unescape(text).strip() for text in texts if text.strip()]
 
 
 def written(about: JudgedRun, findings: list[Advice] | None = None) -> str:
@@ -67,16 +53,15 @@ def test_text_stays_text_in_the_page_and_in_its_scripts(tmp_path: Path) -> None:
     tested = candidate(52, 12, RejectReason.UNKNOWN, detail=NASTY, probability=0.5)
     named = examined(tmp_path, [closure(50, 10)], [tested], accepted(), weights=NASTY)
     page = written(named, [Advice("warning", NASTY, NASTY)])
-    read = Read(page)
-    assert read.scripts == 3 and read.text.count(NASTY) >= 2
+    assert len(re.findall(r"(?i)<script\b", page)) == 3 and shown(page).count(NASTY) >= 2
     assert any(NASTY in pair.get("why", "") for pair in scene_in(page)["pairs"])
 
 
 def test_the_page_stands_alone_and_is_small(tmp_path: Path) -> None:
     page = written(examined(tmp_path, [closure(50, 10)]))
-    own = page.replace(page[page.index("<script>") : page.rindex("<script>")], "")  # less the drawing library
-    assert not re.search(r'(?:src|href)="(?!data:)', own) and len(page) < 10_000_000
-    assert "Plotly" in page
+    library = re.search(r'<script type="text/plain" id="library">data:application/gzip;base64,([^<]*)</script>', page)
+    assert library and not re.search(r'(?:src|href)="(?!data:|#pair=)', page) and len(page) < 1_000_000
+    assert b"Plotly" in gzip.decompress(base64.b64decode(library[1]))
 
 
 def test_every_closure_is_a_row_and_a_pair_with_its_number(tmp_path: Path) -> None:
@@ -91,6 +76,18 @@ def test_every_closure_is_a_row_and_a_pair_with_its_number(tmp_path: Path) -> No
     assert [(pair["kind"], pair["number"]) for pair in told] == [("rejected", 1), ("false", 2), ("rejected", 3)]
     assert told[0]["graph"] == "rejected: contradicts the map (2.0 sigma, 0.10 m)"
     assert told[1]["truth"].startswith("FALSE: 0.80 m") and told[0]["q"] == 25
+
+
+def test_rows_link_to_their_pairs_and_every_bar_has_the_meaning_of_its_measurements(tmp_path: Path) -> None:
+    tested = [candidate(54, 14, RejectReason.IMPROBABLE, **BELOW), candidate(52, 12, None, **BELOW)]
+    page = written(examined(tmp_path, [closure(50, 10), closure(52, 12)], tested, truth=trajectory(), missed=[54]))
+    scene = scene_in(page)
+    links = {int(number): int(pair) for pair, number in re.findall(r'<a href="#pair=(\d+)">(\d+)</a>', page)}
+    assert {number: scene["pairs"][pair]["number"] for number, pair in links.items()} == {1: 1, 2: 2}
+    bars = [(name, pair["values"]) for pair in scene["pairs"] for name, *_ in pair.get("bars", [])]
+    assert len(bars) >= 16 and all(scene["measurements"][name] for name, _ in bars)
+    assert scene["measurements"]["tail_like_noise"]["noise_m"] == MEASUREMENTS["noise_m"]
+    assert bars[0][1]["noise_m"] == BELOW["noise_m"]
 
 
 def test_pending_is_not_rejected(tmp_path: Path) -> None:
@@ -136,11 +133,11 @@ def test_the_terminal_gets_the_same_facts_and_no_line_twice(tmp_path: Path) -> N
     ],
 )
 def test_stated_errors_are_judged_in_a_plain_word(tmp_path: Path, errors: dict[str, Any], said: str) -> None:
-    read = Read(written(examined(tmp_path, ground_truth=TRUTH | errors)))
-    assert any(text.startswith(said) for text in read.text)
+    page = written(examined(tmp_path, ground_truth=TRUTH | errors))
+    assert any(text.startswith(said) for text in shown(page))
 
 
 def test_without_a_keyframe_there_is_no_latency_and_a_page_all_the_same(tmp_path: Path) -> None:
     empty = {stage: {"p50": None} for stage in ("embed", "query", "verify", "total")}
     page = written(examined(tmp_path, keyframe_rows=[], latency_ms=empty, keyframes=0))
-    assert "latency" not in Read(page).text and scene_in(page)["pairs"] == []
+    assert "latency" not in shown(page) and scene_in(page)["pairs"] == []

@@ -10,8 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -58,7 +62,7 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     for one in joint.sessions:
         write_tum(trajectories / f"{one.session.name}.tum", Trajectory(one.stamps, one.poses))
     joint.graph.write_g2o(path / "graph.g2o")
-    _draw(path / "trajectories.png", joint)
+    draw_map(path / "trajectories.png", joint)
     found, ground = write_cloud(folder, joint) if folder.places.is_file() else (dict.fromkeys(THICKNESS, nan), "")
     thickness = {name: None if isnan(value) else round(value, 4) for name, value in found.items()}
     summary = summarise(joint) | {"thickness_m": thickness, "ground": ground, "world": None}
@@ -135,25 +139,32 @@ def _write_poses(path: Path, joint: JointMap) -> None:
         np.savez(file, stamps=np.concatenate(stamps), poses=np.concatenate(poses))
 
 
-def _draw(path: Path, joint: JointMap) -> None:
-    """Plot all joined sessions from above, and the accepted closures between them."""
+def draw_map(path: Path, joint: JointMap, heights: HeightMap | None = None) -> None:
+    """Plot all joined sessions and their accepted closures from above, on the ground where its heights are given."""
     figure = Figure(figsize=(9, 7), layout="constrained")
     axes = figure.subplots()
-    axes.set(xlabel="x [m]", ylabel="y [m]")
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.grid(alpha=0.3)
-    for one in joint.sessions:
-        if one.joined:
-            axes.plot(*one.poses[:, :2, 3].T, linewidth=1.6, label=one.session.name)
-    closures = joint.accepted_between()
-    stamps = np.array([(c.match_stamp_ns, c.query_stamp_ns) for c in closures], np.int64).reshape(-1)
-    poses, known = joint.graph.poses_at(stamps)
-    lines = poses[:, :2, 3].reshape(-1, 2, 2)[known.reshape(-1, 2).all(axis=1)]
-    if len(lines):
-        name = f"closures found: {len(lines)}"
-        axes.add_collection(LineCollection(lines.tolist(), colors="#64748b", linewidths=1.0, alpha=0.8, label=name))
+    halo = [] if heights is None else [withStroke(linewidth=3.0, foreground="white")]
+    if heights is not None and (drawn := heights.draw()) is not None:
+        (left, bottom), (right, top) = heights.lower, heights.upper
+        axes.imshow(drawn[0][..., [2, 1, 0, 3]], extent=(left, right, bottom, top))
+        figure.colorbar(ScalarMappable(Normalize(*drawn[1]), "viridis"), ax=axes, label="height [m]", shrink=0.8)
+    for number, one in enumerate(one for one in joint.sessions if one.joined):
+        axes.plot(*one.poses[:, :2, 3].T, color=f"C{number % 10}", label=one.session.name, path_effects=halo)
+    for name, verdicts, colour in (("within", joint.within, "dimgray"), ("between", joint.between, "black")):
+        ends = [verdict.closure.endpoints for verdict in verdicts if verdict.state is State.ACCEPTED]
+        poses, known = joint.graph.poses_at(np.array(ends, np.int64).reshape(-1))
+        lines = poses[:, :2, 3].reshape(-1, 2, 2)[known.reshape(-1, 2).all(axis=1)]
+        if len(lines):
+            axes.add_collection(LineCollection(lines.tolist(), colors=colour, path_effects=halo))
+            axes.plot(*lines.reshape(-1, 2).T, ".", color=colour, label=f"{len(lines)} closures {name} sessions")
+    span_m = float(np.diff(axes.get_xlim())[0])
+    length_m = max(n * 10.0**power for n in (1, 2, 5) for power in range(-2, 6) if n * 10.0**power <= span_m / 4)
+    size = {"pad": 0.5, "sep": 4, "size_vertical": span_m / 250, "fill_bar": True}
+    axes.add_artist(AnchoredSizeBar(axes.transData, length_m, f"{length_m:g} m", "lower right", **size))
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="best", fontsize=9)
+        figure.legend(loc="outside upper center", ncols=4, fontsize=9)
     with writing(path):
         figure.savefig(path, dpi=120)
 
@@ -239,13 +250,10 @@ def write_cloud(folder: MapFolder, joint: JointMap) -> tuple[dict[str, float], s
     write_points(folder.path / "map.ply", thinned)
     write_points(folder.path / "map.pcd", thinned)
     path = np.concatenate([np.empty((0, 2)), *(one.poses[:, :2, 3] for one in joint.sessions)])
-    if len(path):
+    if len(path) and len(cloud):
         heights = HeightMap(path)
         heights.add(cloud["point"])
-        png = heights.png()
-        if png is not None:
-            with atomic_write(folder.path / "map.png") as part:
-                part.write_bytes(png)
+        draw_map(folder.path / "map.png", joint, heights)
     ground = write_terrain(folder.path, voxels.points(), folder.settings.terrain, joint.world)
     before = thickness(thin(merge(*gather(folder, driven))))
     return {"before": before, "with_moving": thickness(thin(everything)), "after": thickness(thinned)}, ground

@@ -427,7 +427,7 @@ def _errors(about: JudgedRun) -> str:
     before, after = about.ate_odometry_m, about.ate_optimized_m
     if before is None or after is None:
         return ""
-    return f"; trajectory error {before:.2f} m by odometry, {after:.2f} m optimised"
+    return f"; trajectory error (ATE, rigidly aligned) {before:.2f} m by odometry, {after:.2f} m optimised"
 
 
 def _capital(text: str) -> str:

@@ -5,9 +5,11 @@ A file that cannot be written raises an `OutputError`.
 
 from __future__ import annotations
 
+import gzip
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -26,6 +28,7 @@ from umf_ros.runs.run_file import NAME, read_inliers
 from umf_ros.runs.scene import (
     build_scene,
     by_need,
+    data_address,
     drawn_trajectory,
     pairs_of,
     read_pictures,
@@ -71,7 +74,7 @@ def write_page(about: JudgedRun, verdict: RunVerdict, findings: Sequence[Advice]
         closures=closure_rows(about),
         why=command_line("why", run.folder),
         scene=_inside_a_script(scene),
-        plotly=get_plotlyjs(),
+        plotly=data_address("application/gzip", gzip.compress(get_plotlyjs().encode(), 6, mtime=0)),
         version=run.summary["version"],
         weights=run.summary["weights"],
         seed=run.summary["seed"],

@@ -22,7 +22,9 @@ from umf_ros.runs.findings import explain_missed
 from umf_ros.runs.reader import FinishedRun
 from umf_ros.runs.run_file import SCAN_UNIT_M, Endpoints, Picture, RunFile
 from umf_ros.runs.truth import JudgedRun, pose_in_truth, positions_in_truth
+from umf_ros.verification.acceptance import CRITERIA
 from umf_ros.verification.hypothesis import Hypothesis
+from umf_ros.verification.measurement import MEASUREMENTS
 
 ORDER = ("false", "missed", "rejected", "pending", "tested", "accepted")
 """Kinds of pairs, in order of priority where not all pictures fit."""
@@ -115,6 +117,7 @@ def _details(about: JudgedRun, key: Endpoints, number: int) -> dict[str, Any]:
         names = sorted({*given, *lost} - {"bias"}, key=lambda name: -(given.get(name, 0) + lost.get(name, 0)))
         entry["bars"] = [[name, round(given.get(name, 0), 2), round(lost.get(name, 0), 2)] for name in names]
         entry["bias"] = round(given.get("bias", 0), 2)
+        entry["values"] = {name: float(f"{value:.3g}") for name, value in candidate.measurements.items()}
     pose, source = (about.run.closures[number - 1].match_T_query, "the closure") if number else _pose(about, key)
     if pose is not None:
         entry["pose"] = [round(float(value), 4) for value in pose[:3].ravel()]
@@ -157,7 +160,7 @@ def _number(value: float | None) -> float | None:
 
 
 MAP_CELLS, MAP_REACH_M = 700, 25.0  # by hand: bounds the picture
-SHOWN_POINTS = 600  # by hand: of a scan, enough to see the ground
+SHOWN_POINTS = 500  # by hand: of a scan, enough to see the ground
 
 
 class HeightMap:
@@ -183,8 +186,13 @@ class HeightMap:
         np.add.at(self._sum, (column[inside], row[inside]), points[inside, 2])
         np.add.at(self._count, (column[inside], row[inside]), 1)
 
-    def png(self) -> bytes | None:
-        """Return heights as colours and relief as light from the north-west, blank where unknown; None if empty."""
+    def draw(self) -> tuple[Array, tuple[float, float]] | None:
+        """Draw heights as colours and relief as light from the north-west.
+
+        Returns:
+            (H, W, 4) uint8 BGRA pixels with y upwards, blank where unknown; heights in m of the darkest and of the
+            brightest colour. None if the map is empty.
+        """
         seen = self._count > 0
         if not seen.any():
             return None
@@ -197,8 +205,7 @@ class HeightMap:
         shaded = np.clip(colours * light[..., None], 0, 255).astype(np.uint8)
         pixels = np.dstack([shaded, np.where(seen, 255, 0).astype(np.uint8)])
         # columns of the array are y: a picture has y upwards along its rows
-        _, data = cv2.imencode(".png", np.ascontiguousarray(np.swapaxes(pixels, 0, 1)[::-1]))
-        return data.tobytes()
+        return np.ascontiguousarray(np.swapaxes(pixels, 0, 1)[::-1]), (float(low), float(max(high, low + 0.1)))
 
 
 def read_pictures(
@@ -233,8 +240,8 @@ MAX_POINTS = 3000
 """Most points of a curve."""
 MAX_SIDE = 300
 """Rows and columns of the matrix of similarities."""
-MEDIA_BYTES = 3_600_000
-"""Most bytes of all photographs and scans: with the drawing library a page of less than 10 MB."""
+MEDIA_BYTES = 2_500_000
+"""Most bytes of all photographs and scans: with the drawing library a page of less than 5 MB."""
 MAX_INLIERS = 60
 
 
@@ -259,6 +266,7 @@ def build_scene(
     photographs, scans = _media(chosen, pictures)
     for key in chosen:
         pairs[key] |= _details(about, key, pairs[key]["number"])
+    known = {name: one for kind in CRITERIA.values() for name, one in kind.items()}
     for key, lines in inliers.items():
         if key in pairs and str(key[0]) in photographs:
             few = lines[evenly(len(lines), MAX_INLIERS)]
@@ -273,6 +281,9 @@ def build_scene(
         "scans": scans,
         "scan_unit_m": SCAN_UNIT_M,
         "similarity": _similarity(about.run.descriptors),
+        "measurements": {
+            name: {read: MEASUREMENTS[read] for read in one.names or (name,)} for name, one in known.items()
+        },
         "threshold": about.run.settings.verification.min_probability,
         "sweep": _sweep(about),
         "errors": error_curves(about.run) or None,
@@ -295,10 +306,11 @@ def _opened(pairs: list[dict[str, Any]]) -> int:
 
 def _map_picture(heights: HeightMap | None) -> dict[str, Any] | None:
     """Return the map: `data:` address, (x, y) in m of `lower` left and `upper` right corner; None if empty."""
-    png = heights.png() if heights is not None else None
-    if heights is None or png is None:
+    if heights is None or (drawn := heights.draw()) is None:
         return None
-    return {"address": data_address("image/png", png), "lower": heights.lower.tolist(), "upper": heights.upper.tolist()}
+    webp = cv2.imencode(".webp", drawn[0], [cv2.IMWRITE_WEBP_QUALITY, 75])[1].tobytes()
+    corners = {"lower": heights.lower.tolist(), "upper": heights.upper.tolist()}
+    return corners | {"address": data_address("image/webp", webp)}
 
 
 def _media(pairs: Iterable[Endpoints], pictures: Pictures) -> tuple[dict[str, Photograph], dict[str, str]]:

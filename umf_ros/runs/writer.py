@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 PLACES = "places.sqlite"
 """Place database of an unfinished replay whose settings name none."""
-PHOTO_WIDTH, PHOTO_QUALITY, SCAN_POINTS = 360, 60, 3000  # by hand: rocks stay recognisable, at some 30 kB per keyframe
+PHOTO_WIDTH, PHOTO_QUALITY, SCAN_POINTS = 320, 60, 3000  # by hand: rocks stay recognisable, at some 30 kB per keyframe
 
 
 def create_folder(out: Path, bag: Path) -> Path:

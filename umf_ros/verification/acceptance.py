@@ -34,12 +34,14 @@ class Criterion:
         worst: the value that says nothing for a closure.
         best: the value that says all it can.
         missing: score where the value is unknown.
+        names: measurements that `read` takes; empty for one that has the criterion's name.
     """
 
     read: Callable[[Measurements], float]
     worst: float
     best: float
     missing: float = 0.0
+    names: tuple[str, ...] = ()
 
     def __call__(self, measurements: Measurements) -> float:
         """Score between 0 and 1."""
@@ -50,19 +52,19 @@ class Criterion:
 
 
 def _of(name: str, worst: float, best: float, missing: float = 0.0) -> Criterion:
-    return Criterion(lambda known: known.get(name, math.nan), worst, best, missing)
+    return Criterion(lambda known: known.get(name, math.nan), worst, best, missing, (name,))
 
 
 def _log_of(name: str, worst: float, best: float, missing: float = 0.0, floor: float = 1e-3) -> Criterion:
     """The same of the logarithm of a value that is at least `floor`."""
     read = lambda known: math.log(max(known.get(name, math.nan), floor))  # noqa: E731 - of NaN it is NaN
-    return Criterion(read, math.log(worst), math.log(best), missing)
+    return Criterion(read, math.log(worst), math.log(best), missing, (name,))
 
 
 def _log_ratio(above: str, below: str, worst: float, best: float) -> Criterion:
     """The same of the logarithm of a ratio of two sizes."""
     read = lambda known: math.log(max(known[above], 1e-6) / max(known[below], 1e-6))  # noqa: E731
-    return Criterion(read, math.log(worst), math.log(best))
+    return Criterion(read, math.log(worst), math.log(best), names=(above, below))
 
 
 # every range is by hand: wide enough for right poses, beyond the reach of most wrong ones
@@ -87,6 +89,7 @@ CRITERIA: dict[str, dict[str, Criterion]] = {
             lambda known: math.log1p(known.get("inliers_image", 0.0) + known.get("inliers_cloud", 0.0)),
             math.log(10),
             math.log(100),
+            names=("inliers_image", "inliers_cloud"),
         ),
         "similarity": _of("similarity", 0.3, 0.9),
         "support": _of("support", 0.0, 3.0),
@@ -168,8 +171,7 @@ class AcceptanceModel:
     def out_of_range(self, measurements: Measurements) -> str:
         """Name and value of a number that no right example of the fit had; empty without one."""
         for name, (least, greatest) in self.bounds.get(kind_of(measurements), {}).items():
-            value = measurements.get(name, math.nan)
-            if value < least or value > greatest:  # an unknown value is neither
+            if (value := measurements.get(name, math.nan)) < least or value > greatest:  # an unknown value is neither
                 return f"{name} {value:.3g}"
         return ""
 
@@ -182,8 +184,7 @@ class AcceptanceModel:
         """Log-odds that each criterion could have added and did not; without those whose value is unknown."""
         kind, scored = kind_of(measurements), scores(measurements)
         known = [name for name, one in CRITERIA[kind].items() if math.isfinite(one.read(measurements))]
-        weights = self.models[kind].weights
-        lost = {name: weights[name] * (1.0 - scored[name]) for name in known}
+        lost = {name: self.models[kind].weights[name] * (1.0 - scored[name]) for name in known}
         return {name: value for name, value in lost.items() if value > 0}
 
 

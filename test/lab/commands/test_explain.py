@@ -13,6 +13,7 @@ from recordings import LEFT, ODOMETRY, START_NS, image, small_settings, traverse
 
 from umf_ros.core.config import dump_settings
 from umf_ros.core.frames import Image
+from umf_ros.verification.measurement import MEASUREMENTS
 
 
 def probability(ended: Ended) -> float:
@@ -31,8 +32,8 @@ def test_the_same_place_is_accepted_and_its_numbers_are_told(loop_again: tuple[E
     ended, picture = loop_again
     assert ended.status == 0, ended.text
     assert "accepted" in ended.out and probability(ended) > 0.9, ended.out
-    numbers = dict(re.findall(r"^  (\w+) +(\S+)$", ended.out, re.M))
-    assert len(numbers) > 3 and all(float(value) >= 0 for value in numbers.values() if value != "nan")
+    numbers = re.findall(r"^  (\w+) +(\S+) +(\S.*)$", ended.out, re.M)
+    assert len(numbers) > 3 and all(float(value) >= 0 and MEASUREMENTS[name] == text for name, value, text in numbers)
     assert f"wrote {picture}" in ended.out
 
 
@@ -92,9 +93,8 @@ def test_a_picture_has_the_name_that_was_given(small: tuple[Path, list[str | Pat
     bag, options = small
     assert umf("explain", bag, "3", "1", *options[:-1], tmp_path / "picture").status == 0
     assert (tmp_path / "picture").read_bytes().startswith(b"\x89PNG")
-    assert "picture.odd: Format 'odd'" in only_line(
-        umf("explain", bag, "3", "1", *options[:-1], tmp_path / "picture.odd")
-    )
+    refused = umf("explain", bag, "3", "1", *options[:-1], tmp_path / "picture.odd")
+    assert "picture.odd: Format 'odd'" in only_line(refused)
 
 
 def test_a_recording_whose_images_are_all_refused_is_one_line(tmp_path: Path) -> None:

@@ -195,6 +195,7 @@ def explain(
         from umf_ros.bags.frames import FrameReader
         from umf_ros.detector import make_detector_embedder, make_keyframe
         from umf_ros.lab.evaluation.place_views import nearest_frames
+        from umf_ros.verification.measurement import MEASUREMENTS
 
         bag, config = _of_run(source, config) if (source / "summary.json").is_file() else (source, config)
         chosen = options.parameters(config, changes)
@@ -211,10 +212,8 @@ def explain(
         comparison.draw(explanation, frames[0].left, frames[1].left, picture)
     console.print(explanation.verdict, highlight=False)
     if explanation.best is not None:
-        text = f"  {len(explanation.pixels)} image features agree with the pose; inliers_image: with its first guess"
-        console.print(text, highlight=False, soft_wrap=True)
         for name, value in explanation.best.measurements.items():
-            console.print(f"  {name:22} {value:.4g}", highlight=False)
+            console.print(f"  {name:22} {value:<10.4g} {MEASUREMENTS[name]}", highlight=False, soft_wrap=True)
     console.print(f"wrote {picture}", markup=False, highlight=False, soft_wrap=True)
 
 

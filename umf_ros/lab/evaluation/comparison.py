@@ -252,7 +252,8 @@ def _draw_images(axes: Any, explanation: Explanation, query: Image | None, match
     shown = explanation.pixels[:: max(1, len(explanation.pixels) // MOST_LINES)]
     for u, v, match_u, match_v in shown:
         axes.plot([u, match_u + left.shape[1]], [v, match_v], color="limegreen", linewidth=0.7, alpha=0.8)
-    axes.set_title(f"query | match: {len(shown)} of {len(explanation.pixels)} image features that agree with the pose")
+    agreeing = f": {len(shown)} image features that agree with the pose" if len(shown) else ""
+    axes.set_title(f"query | match{agreeing}")
     axes.set_axis_off()
 
 

@@ -4,25 +4,28 @@ const byId = (id) => document.getElementById(id);
 const darkness = matchMedia("(prefers-color-scheme: dark)");
 const narrow = () => innerWidth < 600;
 const KINDS = {
-  accepted: { name: "accepted", colour: "#2da44e", symbol: "circle", shown: true },
-  pending: { name: "pending", colour: "#d4a000", symbol: "diamond", shown: true },
-  rejected: { name: "rejected by the pose graph", colour: "#e5534b", symbol: "x", shown: true },
-  false: { name: "false", colour: "#d6336c", symbol: "star", shown: true },
-  missed: { name: "missed revisit", colour: "#8250df", symbol: "circle-open", shown: true },
-  tested: { name: "rejected by the verification", colour: "#6e7781", symbol: "triangle-up-open", shown: "legendonly" },
+  accepted: { name: "accepted", colours: ["#1a7f37", "#3fb950"], symbol: "circle", shown: true },
+  pending: { name: "pending", colours: ["#8a5d00", "#d29922"], symbol: "diamond", shown: true },
+  rejected: { name: "rejected by the pose graph", colours: ["#cf222e", "#ff7b72"], symbol: "x", shown: true },
+  false: { name: "false", colours: ["#a8236b", "#f778ba"], symbol: "star", shown: true },
+  missed: { name: "missed revisit", colours: ["#7a45d6", "#bc8cff"], symbol: "circle-open", shown: true },
+  tested: { name: "rejected by the verification", colours: ["#57606a", "#9aa4af"], symbol: "triangle-up-open", shown: "legendonly" },
 };
 const BUTTONS = [["zoom2d", "pan2d", "resetScale2d", "toImage"]];
-const CURVES = { "ground truth": ["#24292f", "#c9d1d9"], odometry: ["#e07b00", "#f0a04b"], optimised: ["#1f6fb4", "#58a6ff"] };
+const CURVES = { "ground truth": ["#24292f", "#c9d1d9"], odometry: ["#b85c00", "#f0a04b"], optimised: ["#1f6fb4", "#58a6ff"] };
 let selected = -1;
 
 function colour(name) { return getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim(); }
 function curveColour(name) { return CURVES[name][darkness.matches ? 1 : 0]; }
+function kindColour(kind) { return KINDS[kind].colours[darkness.matches ? 1 : 0]; }
+function markSize(count) { return (narrow() ? 7 : 8) - (count > 50) - (count > 150) - (narrow() && count > 50); }
+function share(value) { return value === null || value === undefined ? undefined : value.toFixed(2); }
 function layout(extra) {
   const axis = { gridcolor: colour("line"), zerolinecolor: colour("line"), linecolor: colour("line"), automargin: true };
   const base = {
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: colour("text"), size: 12 },
     margin: { l: 48, r: 12, t: 8, b: 40 }, legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 },
-    hoverlabel: { align: "left" }, modebar: { orientation: "v", bgcolor: "rgba(0,0,0,0)", color: colour("quiet"), activecolor: colour("accent") }, dragmode: narrow() ? "pan" : "zoom",
+    hoverlabel: { align: "left", bgcolor: colour("card"), bordercolor: colour("quiet"), font: { color: colour("text") } }, modebar: { orientation: "v", bgcolor: "rgba(0,0,0,0)", color: colour("quiet"), activecolor: colour("accent") }, dragmode: narrow() ? "pan" : "zoom",
   };
   const made = { ...base, ...extra };
   for (const key of Object.keys(made)) if (/^[xy]axis/.test(key)) made[key] = { ...axis, ...made[key], title: { text: made[key].title, standoff: 6 } };
@@ -53,11 +56,11 @@ function drawTrajectory() {
     const x = [], y = [];
     for (const [pair] of mine) { x.push(xy[pair.q][0], xy[pair.m][0], null); y.push(xy[pair.q][1], xy[pair.m][1], null); }
     traces.push({ mode: "lines", x, y, hoverinfo: "skip", showlegend: false, legendgroup: kind, visible: style.shown,
-      line: { color: style.colour, width: kind === "accepted" ? 1 : 1.6, dash: kind === "missed" || kind === "tested" ? "dot" : "solid" } });
+      line: { color: kindColour(kind), width: kind === "accepted" ? 1 : 1.6, dash: kind === "missed" || kind === "tested" ? "dot" : "solid" } });
     traces.push({ mode: "markers", name: `${style.name} (${mine.length})`, legendgroup: kind, visible: style.shown,
       x: mine.map(([pair]) => xy[pair.q][0]), y: mine.map(([pair]) => xy[pair.q][1]), customdata: mine.map(([, i]) => i),
       text: mine.map(([pair]) => title(pair) + (pair.p === null ? "" : `<br>probability ${pair.p}`) + (pair.graph ? `<br>pose graph: ${pair.graph}` : "")),
-      hoverinfo: "text", marker: { color: style.colour, symbol: style.symbol, size: narrow() ? 10 : 8, line: { color: style.colour, width: 1.5 } } });
+      hoverinfo: "text", marker: { color: kindColour(kind), symbol: style.symbol, size: markSize(mine.length), line: { color: kindColour(kind), width: 1.2 } } });
   }
   const pair = scene.pairs[selected];
   if (pair) {
@@ -84,17 +87,17 @@ function drawPair() {
   hide("detail", !pair);
   if (!pair) return;
   byId("pair-title").textContent = title(pair);
-  byId("pair-title").style.color = KINDS[pair.kind].colour;
+  byId("pair-mark").style.color = kindColour(pair.kind);
   const table = byId("pair-facts");
   table.replaceChildren();
   row(table, "reason", pair.why);
   row(table, "would accept it", pair.parameter);
   row(table, "probability", pair.p);
-  row(table, "similarity", pair.s);
+  row(table, "similarity", share(pair.s));
   row(table, "pose graph", pair.graph);
   row(table, "ground truth", pair.truth, pair.truth.startsWith("FALSE") ? "bad" : pair.truth.startsWith("true") ? "good" : "");
   if (pair.pose) row(table, "relative pose", `${pair.shift_m} m, ${pair.turn_deg} deg, by ${pair.pose_source}`);
-  row(table, "details", `${scene.explain} ${pair.stamps[0]} ${pair.stamps[1]}`);
+  row(table, "details", `${scene.explain} ${pair.stamps[0]} ${pair.stamps[1]}`, "code");
   drawViews(pair);
   drawScans(pair);
   drawBars(pair);
@@ -151,16 +154,25 @@ function drawScans(pair) {
   view("scans-side", 2, "up [m]", false);
   byId("scans-caption").textContent = pose ? `scans from above and from the side, aligned by ${pair.pose_source}` : "scans from above and from the side, not aligned: no pose available";
 }
+function wrapped(text, width) {
+  const lines = [""];
+  for (const word of text.split(" ")) if ((lines.at(-1) + word).length > width) lines.push(word); else lines.push((lines.pop() + " " + word).trim());
+  return lines.join("<br>");
+}
+function meaning(criterion, values) {
+  return Object.entries(scene.measurements[criterion] || {}).map(([name, text]) => wrapped(`${name}${name in values ? " = " + values[name] : ""}: ${text}`, 48)).join("<br>");
+}
 function drawBars(pair) {
   hide("pair-bars", !pair.bars || !pair.bars.length);
   if (!pair.bars || !pair.bars.length) return;
   const bars = pair.bars.slice(0, 14).reverse(), names = bars.map((bar) => bar[0].replaceAll("_", " "));
+  const explained = bars.map((bar) => meaning(bar[0], pair.values));
   const sum = pair.bars.reduce((total, bar) => total + bar[1], 0);
-  byId("bars-caption").textContent = `Log-odds: sum of the measurements ${sum.toFixed(1)}, bias ${pair.bias.toFixed(1)}; grey: missing to a measurement's maximum.`;
+  byId("bars-caption").textContent = `Log-odds: sum of the measurements ${sum.toFixed(1)}, bias ${pair.bias.toFixed(1)}; grey: missing to a measurement's maximum. Point at a bar for its measurement.`;
   byId("bars").style.height = 40 + 22 * bars.length + "px";
   draw("bars", [
-    { type: "bar", orientation: "h", y: names, x: bars.map((bar) => bar[1]), name: "given", marker: { color: bars.map((bar) => (bar[1] < 0 ? "#e5534b" : "#2da44e")) }, hovertemplate: "%{y}: %{x}<extra></extra>" },
-    { type: "bar", orientation: "h", y: names, x: bars.map((bar) => bar[2]), name: "missing", marker: { color: "rgba(128,128,128,.35)" }, hovertemplate: "%{y}: %{x} missing<extra></extra>" },
+    { type: "bar", orientation: "h", y: names, x: bars.map((bar) => bar[1]), name: "given", marker: { color: bars.map((bar) => kindColour(bar[1] < 0 ? "rejected" : "accepted")) }, text: explained, textposition: "none", hovertemplate: "%{y}: %{x}<br>%{text}<extra></extra>" },
+    { type: "bar", orientation: "h", y: names, x: bars.map((bar) => bar[2]), name: "missing", marker: { color: "rgba(128,128,128,.35)" }, text: explained, textposition: "none", hovertemplate: "%{y}: %{x} missing<br>%{text}<extra></extra>" },
   ], { barmode: "stack", showlegend: false, xaxis: { title: "log-odds" }, yaxis: { title: "", dtick: 1, tickfont: { size: 11 } }, margin: { l: 10, r: 8, t: 4, b: 36 } });
 }
 
@@ -184,7 +196,7 @@ function drawSweep() {
     ? `threshold ${now.toFixed(3)}${asRun}: ${here.found} closures, precision ${percent(here.precision)}, recall ${percent(here.recall)} (${here.closed} of ${here.revisits} revisits)`
     : `threshold ${now.toFixed(3)}${asRun}: ${here.found} closures, no ground truth`;
   const traces = all.some((one) => one.judged) ? [
-    { mode: "lines", name: "precision", x: steps, y: all.map((one) => one.precision), line: { color: "#2da44e", width: 5 } },
+    { mode: "lines", name: "precision", x: steps, y: all.map((one) => one.precision), line: { color: kindColour("accepted"), width: 5 } },
     { mode: "lines", name: "recall", x: steps, y: all.map((one) => one.recall), line: { color: curveColour("optimised"), width: 2 } },
   ] : [{ mode: "lines", name: "closures", x: steps, y: all.map((one) => one.found), line: { color: curveColour("optimised"), width: 2 } }];
   draw("sweep", traces, { xaxis: { title: "verification.min_probability", range: [0, 1.01] }, yaxis: { title: "", rangemode: "tozero" },
@@ -197,11 +209,11 @@ function drawTimeline() {
   for (const kind of ["accepted", "pending", "rejected", "false", "missed"]) {
     const mine = scene.pairs.map((pair, i) => [pair, i]).filter(([pair]) => pair.kind === kind);
     if (mine.length) traces.push({ mode: "markers", name: KINDS[kind].name, x: mine.map(([pair]) => seconds(pair.q)), y: mine.map(([pair]) => pair.p ?? 0), customdata: mine.map(([, i]) => i),
-      text: mine.map(([pair]) => title(pair)), hoverinfo: "text", marker: { color: KINDS[kind].colour, symbol: KINDS[kind].symbol, size: 7 } });
+      text: mine.map(([pair]) => title(pair)), hoverinfo: "text", marker: { color: kindColour(kind), symbol: KINDS[kind].symbol, size: 7 } });
   }
   const timed = frames.latency.some((value) => value !== null);
   if (timed) traces.push({ mode: "lines", name: "ms per keyframe", x: frames.t, y: frames.latency, yaxis: "y2", line: { color: colour("quiet"), width: 1 } });
-  draw("timeline", traces, { hovermode: "closest", xaxis: { title: "time [s]", anchor: timed ? "y2" : "y" }, yaxis: { title: "similarity, probability", domain: timed ? [0.36, 1] : [0, 1] },
+  draw("timeline", traces, { hovermode: "closest", xaxis: { title: "time [s]", anchor: timed ? "y2" : "y" }, yaxis: { title: "similarity, probability", range: [0, 1.06], domain: timed ? [0.36, 1] : [0, 1] },
     ...(timed ? { yaxis2: { title: "ms", domain: [0, 0.28], rangemode: "tozero" } } : {}) });
 }
 function drawErrors() {
@@ -215,8 +227,10 @@ function drawSimilarity() {
   hide("similarity-section", !matrix);
   if (!matrix) return;
   const t = matrix.rows.map(seconds);
-  draw("similarity", [{ type: "heatmap", x: t, y: t, z: { dtype: "i1", bdata: matrix.data, shape: `${t.length}, ${t.length}` }, colorscale: "Viridis", zmin: 0, zmax: 100,
-    colorbar: { title: { text: "%" }, thickness: 12 }, hovertemplate: "%{x} s and %{y} s: %{z} %<extra></extra>" }],
+  const hundredths = Int8Array.from(atob(matrix.data), (letter) => letter.charCodeAt(0));
+  const z = t.map((_, row) => Float32Array.from(hundredths.subarray(row * t.length, (row + 1) * t.length), (n) => n / 100));
+  draw("similarity", [{ type: "heatmap", x: t, y: t, z, zsmooth: t.length > 100 ? "fast" : false, colorscale: "Viridis", zmin: 0, zmax: 1,
+    colorbar: { thickness: 12, outlinewidth: 0 }, hovertemplate: "%{x} s and %{y} s: similarity %{z:.2f}<extra></extra>" }],
     { xaxis: { title: "time [s]", constrain: "domain" }, yaxis: { title: "time [s]", scaleanchor: "x", constrain: "domain" } });
 }
 
@@ -225,11 +239,29 @@ function select(index, scroll) {
   if (index >= 0) history.replaceState(null, "", "#pair=" + index);
   drawTrajectory();
   drawPair();
-  if (scroll && innerWidth <= 900) byId("detail").scrollIntoView({ behavior: "smooth" });
+  if (scroll && byId("detail").getBoundingClientRect().top < 0 || scroll && innerWidth <= 900) byId("detail").scrollIntoView({ behavior: "smooth" });
+}
+function asked() {
+  const index = Number(/^#pair=(\d+)$/.exec(location.hash)?.[1] ?? -1);
+  return index < scene.pairs.length ? index : -1;
 }
 function step(by) { if (scene.pairs.length) select((selected + by + scene.pairs.length) % scene.pairs.length, false); }
 function clicked(event) { const index = event.points.map((point) => point.customdata).find((one) => one !== undefined); if (index !== undefined) select(index, true); }
-function drawAll() { drawTrajectory(); drawPair(); drawSweep(); drawTimeline(); drawErrors(); drawSimilarity(); }
+function pause() { return new Promise((resolve) => setTimeout(resolve)); }
+const FIRST = [drawTrajectory, drawPair], REST = [drawErrors, drawSweep, drawTimeline, drawSimilarity];
+async function drawAll(parts) { for (const part of parts) { part(); await pause(); } }
+async function start() {
+  const library = await fetch(byId("library").textContent);
+  const script = document.createElement("script");
+  script.textContent = await new Response(library.body.pipeThrough(new DecompressionStream("gzip"))).text();
+  document.head.append(script);
+  await drawAll(FIRST);
+  byId("trajectory").on("plotly_click", clicked);
+  document.body.dataset.interactive = "yes";
+  await drawAll(REST);
+  byId("timeline").on("plotly_click", clicked);
+  document.body.dataset.ready = "yes";
+}
 
 hide("map-choice", !scene.map);
 byId("threshold").value = scene.threshold;
@@ -238,11 +270,8 @@ byId("threshold").oninput = drawSweep;
 byId("before").onclick = () => step(-1);
 byId("after").onclick = () => step(1);
 addEventListener("keydown", (event) => { if (event.target.tagName !== "INPUT" && { ArrowLeft: -1, ArrowRight: 1 }[event.key]) step({ ArrowLeft: -1, ArrowRight: 1 }[event.key]); });
-darkness.addEventListener("change", drawAll);
+darkness.addEventListener("change", () => drawAll([...FIRST, ...REST]));
 addEventListener("resize", () => drawPair());
-const opened = scene.opened;
-const asked = /^#pair=(\d+)$/.exec(location.hash);
-selected = asked && Number(asked[1]) < scene.pairs.length ? Number(asked[1]) : opened;
-drawAll();
-for (const id of ["trajectory", "timeline"]) byId(id).on("plotly_click", clicked);
-document.body.dataset.ready = "yes";
+addEventListener("hashchange", () => { if (asked() >= 0) select(asked(), true); });
+selected = asked() >= 0 ? asked() : scene.opened;
+start().catch((error) => { byId("trajectory").textContent = `The plots cannot be drawn in this browser: ${error.message}`; });
