@@ -99,6 +99,8 @@ def _remedy(package: str) -> str:
     """Return the source of a missing package."""
     if package in LAB_PACKAGES:
         return "the lab needs it: run pip install 'umf_ros[lab]'"
+    if package == "torch":
+        return "run pip install 'umf_ros[torch]', or make install-dev"
     if package in FLEET_PACKAGES:
         return "run pip install 'umf_ros[fleet]'"
     return "run umf doctor for a remedy"

@@ -23,7 +23,6 @@ _PACKAGES = {
     "numpy": ("numpy", "1.26"),
     "scipy": ("scipy", "1.16"),
     "cv2": ("opencv-python-headless", "4.10"),
-    "torch": ("torch", "2.4"),
     "safetensors": ("safetensors", "0.4"),
     "small_gicp": ("small_gicp", "1"),
     "gtsam": ("gtsam", "4.3"),
@@ -36,7 +35,12 @@ _PACKAGES = {
     "plotly": ("plotly", "6"),
 }
 """Distribution and first version known to work, by module."""
-_WITHOUT_OPENVINO = "torch runs the network instead (OpenVINO asks for glibc 2.35)"
+_RUNTIMES = {"openvino": ("openvino", "2025"), "torch": ("torch", "2.4")}
+"""One of them has to be installed."""
+_WITHOUT_RUNTIME = {
+    "openvino": "torch runs the network instead (OpenVINO asks for glibc 2.35)",
+    "torch": "only training, a GPU and weights without a model for OpenVINO need it: pip install 'umf_ros[torch]'",
+}
 _WITHOUT_LAB = "only the lab needs it: pip install 'umf_ros[lab]'"
 _MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "visualization_msgs", "std_srvs")
 
@@ -88,7 +92,10 @@ def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
     yield "Python", check_python
     for module, (distribution, minimum) in _PACKAGES.items():
         yield distribution, partial(check_package, module, distribution, minimum)
-    yield "openvino", partial(check_package, "openvino", "openvino", "2025", _WITHOUT_OPENVINO)
+    for module, (distribution, minimum) in _RUNTIMES.items():
+        other = next(name for name in _RUNTIMES if name != module)
+        without = _WITHOUT_RUNTIME[module] if importlib.util.find_spec(other) else ""
+        yield distribution, partial(check_package, module, distribution, minimum, without)
     for module, (distribution, minimum) in LAB_PACKAGES.items():
         yield distribution, partial(check_package, module, distribution, minimum, _WITHOUT_LAB)
     yield "ROS 2 Python", check_rclpy
