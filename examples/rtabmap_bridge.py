@@ -11,6 +11,7 @@ a closure is carried by odometry from both keyframes to the nodes nearest in tim
 
 from __future__ import annotations
 
+import sys
 from bisect import bisect_left, insort
 from contextlib import suppress
 from typing import Any
@@ -104,13 +105,18 @@ def main() -> None:
     """Forward every closure; those whose node is not there yet wait."""
     from types import SimpleNamespace
 
-    import rclpy
-    from geometry_msgs.msg import Quaternion, Transform, Vector3
-    from nav_msgs.msg import Odometry
-    from rclpy.executors import ExternalShutdownException
-    from rclpy.qos import DurabilityPolicy, QoSProfile
-    from rtabmap_msgs.msg import Info, Link
-    from rtabmap_msgs.srv import AddLink
+    try:
+        import rclpy
+        from geometry_msgs.msg import Quaternion, Transform, Vector3
+        from nav_msgs.msg import Odometry
+        from rclpy.executors import ExternalShutdownException
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from rtabmap_msgs.msg import Info, Link
+        from rtabmap_msgs.srv import AddLink
+    except ModuleNotFoundError as error:
+        missing = str(error.name).split(".")[0]
+        first = {"rtabmap_msgs": "sudo apt install ros-jazzy-rtabmap-msgs, then "}.get(missing, "")
+        sys.exit(f"rtabmap_bridge: {missing} is not installed: {first}source /opt/ros/jazzy/setup.bash")
 
     rclpy.init()
     node = rclpy.create_node("rtabmap_bridge")

@@ -66,7 +66,6 @@ def umf() -> typer.Typer:
         name="umf",
         help="Multimodal place recognition and loop closure for rovers with a camera and a LiDAR.",
         no_args_is_help=True,
-        add_completion=False,
         rich_markup_mode="rich",
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},

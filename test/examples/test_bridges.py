@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import re
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -83,6 +86,22 @@ def test_a_link_for_rtabmap_is_carried_to_its_nodes(store: Any) -> None:
     np.testing.assert_allclose(found, truth[:3, :3], atol=1e-9)
     np.testing.assert_allclose(np.linalg.eigvalsh(link.information.reshape(6, 6))[[0, -1]], [1 / 9, 10], atol=1e-9)
     assert store.serialize_cdr(link, "rtabmap_msgs/msg/Link")
+
+
+@pytest.mark.parametrize(
+    ("name", "missing", "remedy"),
+    [
+        ("kimera_bridge", "pose_graph_tools_msgs", "MIT-SPARK/pose_graph_tools"),
+        ("rtabmap_bridge", "rtabmap_msgs", "ros-jazzy-rtabmap-msgs"),
+        ("slam_subscriber", "nav_msgs", "/opt/ros/jazzy/setup.bash"),
+    ],
+)
+def test_one_line_names_the_message_package_that_is_missing(name: str, missing: str, remedy: str) -> None:
+    path = str(EXAMPLES / f"{name}.py")
+    run = f"import runpy, sys; sys.modules[{missing!r}] = None; runpy.run_path({path!r}, run_name='__main__')"
+    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1
+    assert re.fullmatch(rf"{name}: {missing} is not installed: .*{remedy}.*\n", done.stderr)
 
 
 @pytest.mark.parametrize("bridge", ["kimera_bridge", "rtabmap_bridge"])
