@@ -105,18 +105,13 @@ def main() -> None:
     """Forward every closure; those whose node is not there yet wait."""
     from types import SimpleNamespace
 
-    try:
-        import rclpy
-        from geometry_msgs.msg import Quaternion, Transform, Vector3
-        from nav_msgs.msg import Odometry
-        from rclpy.executors import ExternalShutdownException
-        from rclpy.qos import DurabilityPolicy, QoSProfile
-        from rtabmap_msgs.msg import Info, Link
-        from rtabmap_msgs.srv import AddLink
-    except ModuleNotFoundError as error:
-        missing = str(error.name).split(".")[0]
-        first = {"rtabmap_msgs": "sudo apt install ros-jazzy-rtabmap-msgs, then "}.get(missing, "")
-        sys.exit(f"rtabmap_bridge: {missing} is not installed: {first}source /opt/ros/jazzy/setup.bash")
+    import rclpy
+    from geometry_msgs.msg import Quaternion, Transform, Vector3
+    from nav_msgs.msg import Odometry
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from rtabmap_msgs.msg import Info, Link
+    from rtabmap_msgs.srv import AddLink
 
     rclpy.init()
     node = rclpy.create_node("rtabmap_bridge")
@@ -158,4 +153,9 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except ModuleNotFoundError as error:
+        missing = str(error.name).split(".")[0]
+        first = {"rtabmap_msgs": "sudo apt install ros-jazzy-rtabmap-msgs, then "}.get(missing, "")
+        sys.exit(f"rtabmap_bridge: {missing} is not installed: {first}source /opt/ros/jazzy/setup.bash")
