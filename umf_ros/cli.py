@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import signal
+
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during the imports: no traceback
+
 import os
 import re
-import signal
 import sys
 from functools import cache
 from importlib import import_module
 from inspect import getdoc
 from itertools import pairwise
 from typing import Annotated, NoReturn
-
-if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during the imports: no traceback
 
 import typer
 

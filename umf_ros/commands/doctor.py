@@ -39,7 +39,7 @@ _RUNTIMES = {"openvino": ("openvino", "2025"), "torch": ("torch", "2.4")}
 """One of them has to be installed."""
 _WITHOUT_RUNTIME = {
     "openvino": "torch runs the network instead (OpenVINO asks for glibc 2.35)",
-    "torch": "only training, a GPU and weights without a model for OpenVINO need it: pip install 'umf_ros[torch]'",
+    "torch": "for training, umf evaluate, a GPU and weights without a model for OpenVINO: pip install 'umf_ros[torch]'",
 }
 _WITHOUT_LAB = "only the lab needs it: pip install 'umf_ros[lab]'"
 _MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "visualization_msgs", "std_srvs")
