@@ -97,13 +97,10 @@ def _options(version: Version = False) -> None:
 
 def _remedy(package: str) -> str:
     """Return the source of a missing package."""
-    if package in LAB_PACKAGES:
-        return "the lab needs it: run pip install 'umf_ros[lab]'"
-    if package == "torch":
-        return "run pip install 'umf_ros[torch]', or make install-dev"
-    if package in FLEET_PACKAGES:
-        return "run pip install 'umf_ros[fleet]'"
-    return "run umf doctor for a remedy"
+    known = dict.fromkeys(LAB_PACKAGES, "the lab needs it: run pip install 'umf_ros[lab]'")
+    known |= dict.fromkeys(FLEET_PACKAGES, "run pip install 'umf_ros[fleet]'")
+    known["torch"] = "run pip install 'umf_ros[torch]', or make install-dev"
+    return known.get(package, "run umf doctor for a remedy")
 
 
 def main() -> NoReturn:

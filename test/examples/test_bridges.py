@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
-import subprocess
 import sys
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -15,10 +13,11 @@ import pytest
 from recordings import START_NS, odometry
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
+from sources import ROOT, run
 
 from umf_ros.core.geometry import make_pose, relative
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLES = ROOT / "examples"
 
 
 def example(name: str) -> ModuleType:
@@ -98,8 +97,8 @@ def test_a_link_for_rtabmap_is_carried_to_its_nodes(store: Any) -> None:
 )
 def test_one_line_names_the_message_package_that_is_missing(name: str, missing: str, remedy: str) -> None:
     path = str(EXAMPLES / f"{name}.py")
-    run = f"import runpy, sys; sys.modules[{missing!r}] = None; runpy.run_path({path!r}, run_name='__main__')"
-    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, check=False, timeout=60)
+    code = f"import runpy, sys; sys.modules[{missing!r}] = None; runpy.run_path({path!r}, run_name='__main__')"
+    done = run(sys.executable, "-c", code)
     assert done.returncode == 1
     assert re.fullmatch(rf"{name}: {missing} is not installed: .*{remedy}.*\n", done.stderr)
 

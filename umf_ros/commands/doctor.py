@@ -35,12 +35,14 @@ _PACKAGES = {
     "plotly": ("plotly", "6"),
 }
 """Distribution and first version known to work, by module."""
-_RUNTIMES = {"openvino": ("openvino", "2025"), "torch": ("torch", "2.4")}
-"""One of them has to be installed."""
-_WITHOUT_RUNTIME = {
-    "openvino": "torch runs the network instead (OpenVINO asks for glibc 2.35)",
-    "torch": "for training, umf evaluate, a GPU and weights without a model for OpenVINO: pip install 'umf_ros[torch]'",
+_RUNTIMES = {
+    "openvino": ("2025", "torch", "torch runs the network instead (OpenVINO asks for glibc 2.35)"),
+    "torch": (
+        *("2.4", "openvino"),
+        "training, umf evaluate, a GPU and other weights need it: pip install 'umf_ros[torch]'",
+    ),
 }
+"""First version known to work, the other one, of which one is enough, and the consequence, by module."""
 _WITHOUT_LAB = "only the lab needs it: pip install 'umf_ros[lab]'"
 _MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "visualization_msgs", "std_srvs")
 
@@ -92,10 +94,11 @@ def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
     yield "Python", check_python
     for module, (distribution, minimum) in _PACKAGES.items():
         yield distribution, partial(check_package, module, distribution, minimum)
-    for module, (distribution, minimum) in _RUNTIMES.items():
-        other = next(name for name in _RUNTIMES if name != module)
-        without = _WITHOUT_RUNTIME[module] if importlib.util.find_spec(other) else ""
-        yield distribution, partial(check_package, module, distribution, minimum, without)
+    for module, (minimum, other, without) in _RUNTIMES.items():
+        yield (
+            module,
+            partial(check_package, module, module, minimum, without if importlib.util.find_spec(other) else ""),
+        )
     for module, (distribution, minimum) in LAB_PACKAGES.items():
         yield distribution, partial(check_package, module, distribution, minimum, _WITHOUT_LAB)
     yield "ROS 2 Python", check_rclpy

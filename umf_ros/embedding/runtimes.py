@@ -106,8 +106,7 @@ class TorchRuntime:
         try:
             import torch
         except ModuleNotFoundError:
-            why = f"{weights.name} needs it without OpenVINO or its {MODEL_SUFFIX} beside it"
-            raise ConfigError(f"torch is not installed; {why}: pip install 'umf_ros[torch]'") from None
+            raise ConfigError(f"torch is not installed: {weights.name} needs pip install 'umf_ros[torch]'") from None
 
         from umf_ros.networks.umf import FlatUmf
         from umf_ros.networks.weights import load_weights

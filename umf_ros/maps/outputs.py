@@ -181,8 +181,6 @@ def _write_report(folder: Path, summary: dict[str, Any]) -> None:
         sentence=sentence(summary),
         mark="warn" if joined < count or any(one.get("findings") for one in summary["sessions"]) else "good",
         sessions=summary["sessions"],
-        between=in_words(summary["closures_between"]),
-        within=in_words(summary["closures_within"]),
         crispness=crispness(summary),
         **{name: data_address("image/png", p.read_bytes()) if p.is_file() else "" for name, p in pictures.items()},
     )
