@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Install the wheel into a bare venv, replay a recording there and run the notebook; fail without the compiled part or closures.
+# Install the wheel into a bare venv and run the notebook there on a recording; fail without the compiled part or closures.
 #
 #   make wheel && tools/try_wheel.sh [RECORDING]      (default: 70 s are simulated with the package in .venv)
 set -euo pipefail
@@ -16,11 +16,10 @@ cp examples/first_run.ipynb tools/run_notebook.py "$folder"
 cd "$folder" # not the checkout: its package would be imported
 export PATH="$folder/venv/bin:$PATH"
 python -c 'import sys, umf_ros.scan._kernels as part; sys.exit(not part.__file__.startswith(sys.prefix))'
-umf replay "$recording" --out results
+RECORDING=$recording python run_notebook.py first_run.ipynb
 python - results/latest/summary.json <<'END'
 import json, sys
 closures = json.load(open(sys.argv[1]))["closures_published"]
 sys.exit(None if closures else "the wheel finds no closure")
 END
-RECORDING=$recording python run_notebook.py first_run.ipynb
 du -sh venv
