@@ -1,11 +1,12 @@
-# make demo   simulate a traverse, run the real graph over DDS on it, write results/latest
+# make demo   install what it needs, simulate a traverse, run the real graph over DDS on it, write results/latest
 # make test   the whole test suite
 # make test-jazzy   the suite with the versions of an installed Jazzy (NumPy 1.26.4), in a separate venv
 # make check   lint and the fast tests, about two minutes
 # make lint   ruff, mypy, codespell, the import contracts, the rules of prose and the limits of structure
+# make wheel  a wheel with the compiled part, in dist
 # make bench   CPU per scan of a replay and its parts
 # make docs   the documentation as a site, build/site
-.PHONY: demo test check test-jazzy lint bench docs install clean
+.PHONY: demo test check test-jazzy lint bench docs wheel install install-dev clean
 SHELL := /bin/bash
 
 VENV ?= .venv
@@ -17,12 +18,14 @@ PYTHON ?= $(shell for p in python3.12 python3.11 python3; do $$p -c 'import sys;
 BIN := $(VENV)/bin
 # test files in parallel, each worker with one thread; one more than cores, for tests of nodes mostly wait
 JOBS ?= $(shell cores=$$(getconf _NPROCESSORS_ONLN); echo $$((cores < 4 ? cores + 1 : 5)))
+# twice quiet: errors alone; compiled when they are imported, most modules never
+PIP := -m pip install --quiet --quiet --disable-pip-version-check --no-compile --use-pep517
 PYTEST := -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 demo: install
 	@$(BIN)/umf demo --seed $(SEED) $(DEMO)
 
-test: install
+test: install-dev
 	@OMP_NUM_THREADS=1 $(BIN)/python $(PYTEST)
 
 # without slow tests and tests that start nodes, a browser or a database server
@@ -37,14 +40,14 @@ test-jazzy: .venv-jazzy/.installed
 	@test -n "$(PYTHON)" || { echo "make: Python 3.11 or 3.12 is needed (set PYTHON=...)" >&2; exit 1; }
 	@PYTHON=$(PYTHON) ./tools/system_packages.sh
 	@test -x .venv-jazzy/bin/python || $(PYTHON) -m venv .venv-jazzy
-	@grep -hv '^-r' requirements-dev.txt requirements-lab.txt requirements-fleet.txt > .venv-jazzy/tools.txt
+	@grep -hv '^-r' requirements-demo.txt requirements-dev.txt requirements-lab.txt requirements-fleet.txt \
+		> .venv-jazzy/tools.txt
 	@./tools/install_torch.sh .venv-jazzy/bin/python $(TORCH_INDEX)
-	@.venv-jazzy/bin/python -m pip install --quiet --disable-pip-version-check --use-pep517 -r requirements-jazzy.txt \
-		-r requirements-ros.txt -r .venv-jazzy/tools.txt
-	@.venv-jazzy/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@.venv-jazzy/bin/python $(PIP) -r requirements-jazzy.txt -r requirements-ros.txt -r .venv-jazzy/tools.txt
+	@.venv-jazzy/bin/python $(PIP) --no-deps --no-build-isolation --editable .
 	@touch $@
 
-lint: install
+lint: install-dev
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
@@ -58,22 +61,34 @@ bench: install
 
 # every page and every link, as a site in build/site
 docs: export REPOSITORY_URL ?= $(shell git remote get-url origin 2>/dev/null | sed 's,^git@\(.*\):,https://\1/,; s,\.git$$,,')
-docs: install
+docs: install-dev
 	@$(BIN)/python tools/parameters_doc.py --check
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
+# in build/wheel first: in dist there may be others
+wheel: install
+	@rm -rf build/wheel
+	@$(BIN)/python -m pip wheel --quiet --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir build/wheel .
+	@mkdir -p dist && mv build/wheel/*.whl dist && ls dist/umf_ros-*.whl
+
 install: $(VENV)/.installed
+install-dev: $(VENV)/.installed-dev
 
 # requirements in a separate step: they change rarely and take most of the time
 $(VENV)/.installed: $(wildcard requirements*.txt) package.xml setup.py setup.cfg pyproject.toml $(wildcard umf_ros/scan/kernels/*)
 	@test -n "$(PYTHON)" || { echo "make: Python 3.11 or 3.12 is needed (set PYTHON=...)" >&2; exit 1; }
 	@PYTHON=$(PYTHON) ./tools/system_packages.sh
 	@test -x $(BIN)/python || { echo "Making $(VENV) with $$($(PYTHON) --version)"; $(PYTHON) -m venv $(VENV); }
+	@echo "Installing the requirements, with Open3D for the simulator (one to three minutes the first time)"
+	@$(BIN)/python $(PIP) -r requirements-demo.txt
+	@$(BIN)/python $(PIP) --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
 	@./tools/install_torch.sh $(BIN)/python $(TORCH_INDEX)
-	@echo "Installing the requirements (one to three minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pep517 -r requirements-dev.txt
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@echo "Installing torch, Ray, PostgreSQL, Rerun and the tools of tests and documentation (some minutes the first time)"
+	@$(BIN)/python $(PIP) -r requirements-dev.txt
 	@touch $@
 
 clean:
-	rm -rf build install log results data *.egg-info
+	rm -rf build dist install log results data *.egg-info

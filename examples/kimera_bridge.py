@@ -7,6 +7,7 @@ The key of a pose is the stamp of its keyframe in ns. `~/robot_id` is the robot'
 
 from __future__ import annotations
 
+import sys
 from contextlib import suppress
 from typing import Any
 
@@ -38,11 +39,17 @@ def to_pose_graph(message: Any, robot: int, types: Any) -> Any:
 
 def main() -> None:
     """Forward every closure."""
-    import rclpy
-    from nav_msgs.msg import Odometry
-    from pose_graph_tools_msgs import msg
-    from rclpy.executors import ExternalShutdownException
-    from rclpy.qos import DurabilityPolicy, QoSProfile
+    try:
+        import rclpy
+        from nav_msgs.msg import Odometry
+        from pose_graph_tools_msgs import msg
+        from rclpy.executors import ExternalShutdownException
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+    except ModuleNotFoundError as error:
+        missing, remedy = str(error.name).split(".")[0], "source /opt/ros/jazzy/setup.bash"
+        if missing == "pose_graph_tools_msgs":
+            remedy = "build https://github.com/MIT-SPARK/pose_graph_tools in your workspace and source its setup.bash"
+        sys.exit(f"kimera_bridge: {missing} is not installed: {remedy}")
 
     rclpy.init()
     node = rclpy.create_node("kimera_bridge")

@@ -11,6 +11,7 @@ a closure is carried by odometry from both keyframes to the nodes nearest in tim
 
 from __future__ import annotations
 
+import sys
 from bisect import bisect_left, insort
 from contextlib import suppress
 from typing import Any
@@ -152,4 +153,9 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except ModuleNotFoundError as error:
+        missing = str(error.name).split(".")[0]
+        first = {"rtabmap_msgs": "sudo apt install ros-jazzy-rtabmap-msgs, then "}.get(missing, "")
+        sys.exit(f"rtabmap_bridge: {missing} is not installed: {first}source /opt/ros/jazzy/setup.bash")

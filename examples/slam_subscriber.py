@@ -3,15 +3,21 @@
 python examples/slam_subscriber.py      (with ROS 2 Jazzy, no package of umf_ros needed)
 """
 
+import sys
 from contextlib import suppress
 
-import gtsam
-import numpy as np
-import rclpy
-from nav_msgs.msg import Odometry
-from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+try:
+    import gtsam
+    import numpy as np
+    import rclpy
+    from nav_msgs.msg import Odometry
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.node import Node
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+except ModuleNotFoundError as error:
+    missing = str(error.name).split(".")[0]
+    remedy = "pip install gtsam" if missing == "gtsam" else "source /opt/ros/jazzy/setup.bash"
+    sys.exit(f"slam_subscriber: {missing} is not installed: {remedy}")
 
 # with the history of the run, for late subscribers
 LATCHED = QoSProfile(depth=5000, durability=DurabilityPolicy.TRANSIENT_LOCAL)

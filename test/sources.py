@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import subprocess
 import tomllib
 from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import Requirement
 
@@ -30,6 +32,11 @@ def requirements(*parts: str) -> dict[str, Requirement]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     listed = {"dependencies": project["dependencies"], **project["optional-dependencies"]}
     return {one.name.lower(): one for part in parts for one in map(Requirement, listed[part])}
+
+
+def run(*command: Any, timeout: float = 60, **options: Any) -> subprocess.CompletedProcess[str]:
+    """A command that has ended, well or not, with its output."""
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=timeout, **options)
 
 
 @cache

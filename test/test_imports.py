@@ -63,7 +63,7 @@ def without(missing: list[str]) -> str:
 
 def lab_packages() -> list[str]:
     """Modules of the distributions that only the lab asks for."""
-    wanted = requirements("lab").keys()
+    wanted = requirements("lab").keys() - requirements("torch").keys()
     return [module for module, owners in distributions().items() if owners & wanted]
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from sources import run
 
 import umf_ros
 from umf_ros.core.errors import UmfError
@@ -31,15 +31,8 @@ def found_by(site_packages: Path, relative: str) -> str:
         "import sys\nfrom umf_ros.core.resources import find\nfrom umf_ros.core.errors import UmfError\n"
         "try:\n    print(find(sys.argv[1]))\nexcept UmfError as error:\n    print(error)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, relative],
-        env={"PYTHONPATH": str(site_packages)},
-        cwd=site_packages,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
+    done = run(sys.executable, "-c", code, relative, env={"PYTHONPATH": str(site_packages)}, cwd=site_packages)
+    assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 
 

@@ -37,10 +37,11 @@ if [ "$(printf '%s\n' 2.35 "$glibc" | sort -V | head -1)" != 2.35 ]; then
   requirements=$(mktemp)
   trap 'rm -f "$requirements"' EXIT
   grep -v '^openvino' "$repository/requirements-jazzy.txt" >"$requirements"
+  "$repository/tools/install_torch.sh" "$venv/bin/python" "$torch_index"
+  cat "$repository/requirements-torch.txt" >>"$requirements"
 fi
 echo "Installing the Python packages into $venv (some minutes the first time)"
-"$repository/tools/install_torch.sh" "$venv/bin/python" "$torch_index"
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -r "$requirements"
+"$venv/bin/python" -m pip install --quiet --quiet --disable-pip-version-check -r "$requirements"
 
 cd "$workspace"
 # shellcheck disable=SC1091

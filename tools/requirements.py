@@ -41,17 +41,27 @@ class Pinned:
 FILES = {
     "requirements.txt": Pinned(
         RUNTIME,
-        "needed on a rover; ROS 2 itself comes from an installed Jazzy or from requirements-ros.txt;\n"
-        "tools/install_torch.sh installs the CPU build of torch: a plain torch pulls gigabytes of CUDA",
+        "needed on a rover; ROS 2 itself comes from an installed Jazzy or from requirements-ros.txt",
     ),
     "requirements-jazzy.txt": Pinned(
         RUNTIME,
         "beside an installed Jazzy (Ubuntu 24.04, Python 3.12), in a venv made with --system-site-packages:\n"
         "tools/install_jazzy.sh does it all. NumPy stays below 2, as the system's cv_bridge and others need it. On\n"
-        "aarch64 the same set has wheels; openvino asks for glibc 2.35, and without it torch runs the network",
+        "aarch64 the same set has wheels; openvino asks for glibc 2.35, and without it torch runs the network\n"
+        "(requirements-torch.txt)",
         fixed=("numpy==1.26.4",),
     ),
     "requirements-ros.txt": Pinned("ros", "ROS 2 Jazzy from PyPI, where Jazzy itself is not installed"),
+    "requirements-demo.txt": Pinned(
+        "demo",
+        "for make demo, with the renderer of the simulator",
+        includes=("requirements.txt", "requirements-ros.txt"),
+    ),
+    "requirements-torch.txt": Pinned(
+        "torch",
+        "networks without a model for OpenVINO, and a GPU;\n"
+        "tools/install_torch.sh installs the CPU build: a plain torch pulls gigabytes of CUDA",
+    ),
     "requirements-lab.txt": Pinned("lab", "simulation, training and evaluation"),
     "requirements-fleet.txt": Pinned("fleet", "a fleet's PostgreSQL, and many machines; a single rover needs neither"),
     "requirements-elevation.txt": Pinned("elevation", "elevation models as GeoTIFF"),
@@ -62,7 +72,7 @@ FILES = {
     "requirements-dev.txt": Pinned(
         "dev",
         "everything, with tests, lint and packaging checks",
-        includes=tuple(f"requirements{part}.txt" for part in ("", "-ros", "-lab", "-rerun", "-fleet", "-elevation")),
+        includes=tuple(f"requirements-{part}.txt" for part in ("demo", "torch", "lab", "rerun", "fleet", "elevation")),
     ),
 }
 HEAD = "made by tools/requirements.py from pyproject.toml: "
@@ -75,16 +85,22 @@ def wanted(part: str) -> dict[str, Requirement]:
     return {canonicalize_name(one.name): one for one in map(Requirement, lines)}
 
 
+def pins(name: str) -> list[str]:
+    """Lines of a pinned file that name a requirement."""
+    path = ROOT / name
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return [line for line in lines if line and not line.startswith(("#", "-r "))]
+
+
 def faults(name: str) -> list[str]:
     """Differences of a pinned file from the list, one line each."""
     path, bounds = ROOT / name, wanted(FILES[name].part)
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     included = {line.removeprefix("-r ") for line in lines if line.startswith("-r ")}
-    pins = [Requirement(line) for line in lines if line and not line.startswith(("#", "-r "))]
-    pinned = {canonicalize_name(one.name): one for one in pins}
+    pinned = {canonicalize_name(one.name): one for one in map(Requirement, pins(name))}
     found = [f"{one} is missing" for key, one in bounds.items() if key not in pinned]
     found += [f"{one.name} is not in pyproject.toml" for key, one in pinned.items() if key not in bounds]
-    found += [f"{one} is missing" for one in FILES[name].fixed if one not in map(str, pins)]
+    found += [f"{one} is missing" for one in FILES[name].fixed if one not in map(str, pinned.values())]
     found += [f"-r {one} is wrong" for one in sorted(included ^ set(FILES[name].includes))]
     for key in pinned.keys() & bounds.keys():
         versions = [one.version for one in pinned[key].specifier if one.operator == "=="]
@@ -92,27 +108,32 @@ def faults(name: str) -> list[str]:
             found.append(f"{pinned[key]} does not pin {bounds[key]}")
         if pinned[key].extras != bounds[key].extras:
             found.append(f"{pinned[key]} has other extras than {bounds[key]}")
+        if pinned[key].marker != bounds[key].marker:
+            found.append(f"{pinned[key]} is for other machines than {bounds[key]}")
     return [f"{name}: {one}" for one in found]
 
 
 def resolved(names: list[str]) -> dict[str, str]:
-    """The newest versions that go together, by canonical name, for this Python."""
+    """The newest versions that go together, by canonical name, for this Python; pins of other machines stay."""
     lines = [str(one) for name in names for one in wanted(FILES[name].part).values()]
     lines += [one for name in names for one in FILES[name].fixed]
     pip = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--quiet", "--report", "-"]
     report = json.loads(subprocess.check_output([*pip, *lines], text=True))["install"]
-    return {canonicalize_name(one["metadata"]["name"]): one["metadata"]["version"] for one in report}
+    kept = [Requirement(line) for name in names for line in pins(name)]
+    versions = {canonicalize_name(one.name): next(iter(one.specifier)).version for one in kept if one.marker}
+    return versions | {canonicalize_name(one["metadata"]["name"]): one["metadata"]["version"] for one in report}
 
 
 def write(name: str, versions: dict[str, str]) -> None:
     """Write a pinned file."""
     about = [f"# {line}" for line in (HEAD + FILES[name].about).splitlines()]
     included = [f"-r {one}" for one in FILES[name].includes]
-    pins = []
+    lines = []
     for key, one in sorted(wanted(FILES[name].part).items()):
         extras = f"[{','.join(sorted(one.extras))}]" if one.extras else ""
-        pins.append(f"{one.name}{extras}=={versions[key].split('+')[0]}")
-    (ROOT / name).write_text("\n".join([*about, *included, *pins]) + "\n", encoding="utf-8")
+        marker = f"; {one.marker}" if one.marker else ""
+        lines.append(f"{one.name}{extras}=={versions[key].split('+')[0]}{marker}")
+    (ROOT / name).write_text("\n".join([*about, *included, *lines]) + "\n", encoding="utf-8")
 
 
 def main() -> int:

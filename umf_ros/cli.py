@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import signal
+
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during the imports: no traceback
+
 import os
 import re
-import signal
 import sys
 from functools import cache
 from importlib import import_module
 from inspect import getdoc
 from itertools import pairwise
 from typing import Annotated, NoReturn
-
-if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during the imports: no traceback
 
 import typer
 
@@ -66,7 +67,6 @@ def umf() -> typer.Typer:
         name="umf",
         help="Multimodal place recognition and loop closure for rovers with a camera and a LiDAR.",
         no_args_is_help=True,
-        add_completion=False,
         rich_markup_mode="rich",
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
@@ -97,11 +97,10 @@ def _options(version: Version = False) -> None:
 
 def _remedy(package: str) -> str:
     """Return the source of a missing package."""
-    if package in LAB_PACKAGES:
-        return "the lab needs it: run pip install 'umf_ros[lab]'"
-    if package in FLEET_PACKAGES:
-        return "run pip install 'umf_ros[fleet]'"
-    return "run umf doctor for a remedy"
+    known = dict.fromkeys(LAB_PACKAGES, "the lab needs it: run pip install 'umf_ros[lab]'")
+    known |= dict.fromkeys(FLEET_PACKAGES, "run pip install 'umf_ros[fleet]'")
+    known["torch"] = "run pip install 'umf_ros[torch]', or make install-dev"
+    return known.get(package, "run umf doctor for a remedy")
 
 
 def main() -> NoReturn:

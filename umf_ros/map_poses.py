@@ -13,7 +13,7 @@ import numpy as np
 
 from umf_ros.absolute.measurement import parse_numbers
 from umf_ros.core.config import Settings
-from umf_ros.core.errors import MessageError, UmfError, one_line
+from umf_ros.core.errors import MessageError, UmfError, command_line, one_line
 from umf_ros.core.frames import Keyframe
 from umf_ros.core.geometry import Array, heading, invert, make_pose, relative, rotation_angle
 from umf_ros.core.io import write_atomically
@@ -38,7 +38,8 @@ def read_poses(path: Path) -> Trajectory:
             return Trajectory(stored["stamps"], stored["poses"])
     except Exception as error:  # damaged bytes raise any exception
         cause = one_line(error)
-        raise UmfError(f"{path / POSES} cannot be read ({cause}): run umf map to solve the map") from None
+        again = command_line("map", "edit", path)
+        raise UmfError(f"{path / POSES} cannot be read ({cause}): solve the map with {again}") from None
 
 
 class InitialPose(NamedTuple):

@@ -131,6 +131,13 @@ def test_a_straight_drive_keeps_the_usual_order_of_its_quaternions(tmp_path: Pat
     np.testing.assert_allclose(read_tum(path).poses, straight, atol=1e-8)
 
 
+@pytest.mark.filterwarnings("error")
+def test_one_pose_is_refused_without_a_warning_of_numpy(tmp_path: Path) -> None:
+    (tmp_path / "a.tum").write_text("1.0 0 0 0 0 0 0 1\n")
+    with pytest.raises(BagError, match=r"a\.tum holds a single pose, which is no odometry$"):
+        read_odometry(tmp_path / "a.tum", "body", load_settings())
+
+
 @pytest.mark.parametrize("tail", ["", " 0 0 0 1", " 0 0 0 0", " 0.6 0 0 0.8"])
 def test_positions_alone_have_no_orientation_and_are_no_odometry(tail: str, tmp_path: Path) -> None:
     path = tmp_path / "a.tum"

@@ -52,12 +52,21 @@ def test_a_missing_package_is_a_problem() -> None:
     assert "pip install 'no-such-package>=1'" in finding.advice
 
 
-@pytest.mark.parametrize(("package", "told"), [("openvino", "torch runs the network"), ("open3d", "umf_ros[lab]")])
+@pytest.mark.parametrize(
+    ("package", "told"),
+    [("openvino", "torch runs the network"), ("torch", "umf_ros[torch]"), ("open3d", "umf_ros[lab]")],
+)
 def test_a_rover_may_do_without_some(package: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
     check, real = dict(checks.checks())[package], importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else real(name))
     finding = check()
     assert finding.fine and finding.found.startswith("not installed; ") and told in finding.found
+
+
+def test_the_network_needs_openvino_or_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    found = {name: check() for name, check in checks.checks() if name in ("openvino", "torch")}
+    assert {name: finding.fine for name, finding in found.items()} == {"openvino": False, "torch": False}
 
 
 def test_what_a_rover_may_do_without_has_to_work_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

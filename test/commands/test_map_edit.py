@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 import json
+import shlex
 from pathlib import Path
 
 import pytest
 from command_line import only_line, umf
 from maps_made import MadeSession, made_map, tie
 
+from umf_ros.core.errors import UmfError
+from umf_ros.map_poses import POSES, read_poses
 from umf_ros.maps.joint_graph import solve
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.outputs import write_results
@@ -63,3 +66,12 @@ def test_what_is_no_closure_of_the_map_is_one_line_and_changes_nothing(folder: M
     (folder.path / "edits.json").write_text(json.dumps([{"match": 1}]))
     assert "edits.json is damaged: " in only_line(umf("map", "edit", folder.path))
     assert "is not a map" in only_line(umf("map", "edit", folder.path / "nowhere"))
+
+
+def test_a_map_without_poses_names_the_command_that_solves_it(folder: MapFolder) -> None:
+    (folder.path / POSES).unlink()
+    with pytest.raises(UmfError) as told:
+        read_poses(folder.path)
+    program, *words = shlex.split(str(told.value).partition("solve the map with ")[2])
+    assert program == "umf" and umf(*words).status == 0
+    assert len(read_poses(folder.path))

@@ -132,6 +132,12 @@ def test_weights_with_a_model_beside_them_run_in_openvino_and_others_in_torch(co
         xfeat(copy, "openvino")
 
 
+def test_without_torch_one_line_names_the_package(monkeypatch, copy):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(ConfigError, match=r"^torch is not installed: .* needs pip install 'umf_ros\[torch\]'$"):
+        xfeat(copy, "torch")
+
+
 def test_without_openvino_torch_runs_the_same_weights(monkeypatch):
     from umf_ros.embedding import runtimes
 

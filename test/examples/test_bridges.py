@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from pathlib import Path
+import re
+import sys
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -12,10 +13,11 @@ import pytest
 from recordings import START_NS, odometry
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
+from sources import ROOT, run
 
 from umf_ros.core.geometry import make_pose, relative
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLES = ROOT / "examples"
 
 
 def example(name: str) -> ModuleType:
@@ -83,6 +85,22 @@ def test_a_link_for_rtabmap_is_carried_to_its_nodes(store: Any) -> None:
     np.testing.assert_allclose(found, truth[:3, :3], atol=1e-9)
     np.testing.assert_allclose(np.linalg.eigvalsh(link.information.reshape(6, 6))[[0, -1]], [1 / 9, 10], atol=1e-9)
     assert store.serialize_cdr(link, "rtabmap_msgs/msg/Link")
+
+
+@pytest.mark.parametrize(
+    ("name", "missing", "remedy"),
+    [
+        ("kimera_bridge", "pose_graph_tools_msgs", "MIT-SPARK/pose_graph_tools"),
+        ("rtabmap_bridge", "rtabmap_msgs", "ros-jazzy-rtabmap-msgs"),
+        ("slam_subscriber", "nav_msgs", "/opt/ros/jazzy/setup.bash"),
+    ],
+)
+def test_one_line_names_the_message_package_that_is_missing(name: str, missing: str, remedy: str) -> None:
+    path = str(EXAMPLES / f"{name}.py")
+    code = f"import runpy, sys; sys.modules[{missing!r}] = None; runpy.run_path({path!r}, run_name='__main__')"
+    done = run(sys.executable, "-c", code)
+    assert done.returncode == 1
+    assert re.fullmatch(rf"{name}: {missing} is not installed: .*{remedy}.*\n", done.stderr)
 
 
 @pytest.mark.parametrize("bridge", ["kimera_bridge", "rtabmap_bridge"])

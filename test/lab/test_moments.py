@@ -28,7 +28,7 @@ def test_stamps_and_seconds_are_told_apart(text: str, moment: int | float) -> No
     assert found == moment and type(found) is type(moment)
 
 
-@pytest.mark.parametrize("text", ["soon", "", "-1", "nan", "inf", "2e9"])
+@pytest.mark.parametrize("text", ["soon", "", "-1", "nan", "inf", "2e9", "1_0"])
 def test_what_is_no_moment(text: str) -> None:
     with pytest.raises(ValueError, match=r"neither a stamp|before the start"):
         parse_moment(text)

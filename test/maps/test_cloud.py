@@ -95,7 +95,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
         *("--config", folder / "config.yaml", "--out", folder / "map"),
     )
     assert done.status == 0, done.err
-    assert "30 places" in done.out and "15 of 15 accepted" in done.out
+    assert "30 places" in done.out and "15 found, 15 accepted" in done.out
     return folder / "map"
 
 

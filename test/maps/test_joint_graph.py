@@ -13,7 +13,7 @@ from umf_ros.core.config import Settings
 from umf_ros.core.geometry import from_enu, make_pose, to_enu, transform
 from umf_ros.map_poses import read_poses
 from umf_ros.maps.joint_graph import JointMap, solve
-from umf_ros.maps.outputs import draw_map, sentence, write_results
+from umf_ros.maps.outputs import draw_map, sentence, summarise, write_results
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.run_file import RunFile
 from umf_ros.runs.truth import absolute_trajectory_error
@@ -93,8 +93,8 @@ def test_results_are_listed_by_session(tmp_path: Path) -> None:
     summary = write_results(folder, joint)
     assert json.loads((folder.path / "summary.json").read_text()) == summary
     assert summary["joined"] == 2 and summary["closures_between"]["accepted"] == 3
-    within = summary["closures_within"] | {"found": 9, "accepted": 8}
-    assert sentence({"sessions": [{}], "closures_within": within}) == "one session; 8 of 9 closures accepted"
+    counts = {f"closures_{where}": {"found": 9, "accepted": 6, "pending": 3} for where in ("within", "between")}
+    assert sentence({"sessions": [{}], **counts}) == "one session; its closures: 9 found, 6 accepted, 3 pending"
     assert [one["graph_sessions"] for one in summary["sessions"]] == [[0], [1]]
     with (folder.path / "graph.csv").open() as file:
         sessions = [row["session"] for row in csv.DictReader(file)]
@@ -118,6 +118,7 @@ def test_the_largest_part_is_the_map_wherever_the_first_session_is(tmp_path: Pat
     second.between = [tie((DAY_NS, 2 * DAY_NS), first, second, metre) for metre in PLACES]
     joint = solve(made_map(tmp_path / "map", [alone, first, second]))
     assert [one.joined for one in joint.sessions] == [False, True, True]
+    assert summarise(joint)["sessions"][0]["length_m"] == 15  # driven, though not in the map
     there = transform(np.linalg.inv(on_circle(np.array([0]))[0]), first.truth[:, :3, 3])
     assert np.abs(joint.sessions[1].poses[:, :3, 3] - there).max() < 2
 

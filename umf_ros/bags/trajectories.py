@@ -111,8 +111,9 @@ def _is_w_first(positions: Array, quaternions: Array) -> bool:
     """Return whether the body moves along one axis of its own if w is first in quaternions (N, 4), and not if last."""
     rows = np.unique(np.linspace(0, len(positions) - 1, PIECES + 1).astype(int))
     moved = np.diff(positions[rows], axis=0)
-    far = np.linalg.norm(moved, axis=1) > 0.2 * np.mean(np.linalg.norm(moved, axis=1))
-    directions = moved[far] / np.linalg.norm(moved[far], axis=1, keepdims=True)
+    lengths = np.linalg.norm(moved, axis=1, keepdims=True)
+    far = (len(lengths) * lengths > 0.2 * lengths.sum())[:, 0]  # no mean: a single pose has no steps
+    directions = moved[far] / lengths[far]
     orders = (np.roll(quaternions, -first, axis=1)[rows[:-1][far]] for first in (0, 1))
     seen = [Rotation.from_quat(turns).inv().apply(directions) for turns in orders]
     last, first = (np.linalg.eigvalsh(one.T @ one / max(len(one), 1))[-1] for one in seen)

@@ -23,7 +23,6 @@ _PACKAGES = {
     "numpy": ("numpy", "1.26"),
     "scipy": ("scipy", "1.16"),
     "cv2": ("opencv-python-headless", "4.10"),
-    "torch": ("torch", "2.4"),
     "safetensors": ("safetensors", "0.4"),
     "small_gicp": ("small_gicp", "1"),
     "gtsam": ("gtsam", "4.3"),
@@ -36,7 +35,14 @@ _PACKAGES = {
     "plotly": ("plotly", "6"),
 }
 """Distribution and first version known to work, by module."""
-_WITHOUT_OPENVINO = "torch runs the network instead (OpenVINO asks for glibc 2.35)"
+_RUNTIMES = {
+    "openvino": ("2025", "torch", "torch runs the network instead (OpenVINO asks for glibc 2.35)"),
+    "torch": (
+        *("2.4", "openvino"),
+        "training, umf evaluate, a GPU and other weights need it: pip install 'umf_ros[torch]'",
+    ),
+}
+"""First version known to work, the other one, of which one is enough, and the consequence, by module."""
 _WITHOUT_LAB = "only the lab needs it: pip install 'umf_ros[lab]'"
 _MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "visualization_msgs", "std_srvs")
 
@@ -88,7 +94,11 @@ def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
     yield "Python", check_python
     for module, (distribution, minimum) in _PACKAGES.items():
         yield distribution, partial(check_package, module, distribution, minimum)
-    yield "openvino", partial(check_package, "openvino", "openvino", "2025", _WITHOUT_OPENVINO)
+    for module, (minimum, other, without) in _RUNTIMES.items():
+        yield (
+            module,
+            partial(check_package, module, module, minimum, without if importlib.util.find_spec(other) else ""),
+        )
     for module, (distribution, minimum) in LAB_PACKAGES.items():
         yield distribution, partial(check_package, module, distribution, minimum, _WITHOUT_LAB)
     yield "ROS 2 Python", check_rclpy

@@ -299,6 +299,7 @@ def _add(target: MapFolder, name: str, recording: Path, opening: Opening, consol
 
 
 def _print_summary(out: Path, summary: dict[str, Any], console: Console) -> None:
+    from umf_ros.commands.console import WARNING
     from umf_ros.maps.outputs import crispness, sentence
 
     for one in summary["sessions"]:
@@ -307,6 +308,8 @@ def _print_summary(out: Path, summary: dict[str, Any], console: Console) -> None
         size = f"{one['places']} places, {one['length_m']:.0f} m"
         told = f"; {told}" if len(summary["sessions"]) > 1 else ""
         console.print(f"  {one['name']}: {size}{told}", markup=False, soft_wrap=True)
+        for finding in one.get("findings", []):
+            console.print(f"    {finding}", **WARNING)
     files = f"{out}: {summary['ground']}" if summary.get("ground") else ""
     for line in filter(None, (f"{out}: {sentence(summary)}", crispness(summary), files, f"{out / 'report.html'}")):
         console.print(line, markup=False, soft_wrap=True)

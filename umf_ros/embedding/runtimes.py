@@ -99,11 +99,14 @@ class TorchRuntime:
 
     Raises:
         WeightsError: the weights cannot be used.
-        ConfigError: torch does not support the device.
+        ConfigError: torch is not installed, or does not support the device.
     """
 
     def __init__(self, weights: Path, outputs: tuple[str, ...], device: str, threads: int) -> None:
-        import torch
+        try:
+            import torch
+        except ModuleNotFoundError:
+            raise ConfigError(f"torch is not installed: {weights.name} needs pip install 'umf_ros[torch]'") from None
 
         from umf_ros.networks.umf import FlatUmf
         from umf_ros.networks.weights import load_weights

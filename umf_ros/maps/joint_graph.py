@@ -31,6 +31,7 @@ class JointSession:
         stamps: (N,) of its keyframes with a pose in the map, ns of its own clock.
         poses: (N, 4, 4) `map_T_body` there.
         odometry: (N, 4, 4) `odom_T_body` there.
+        path_length_m: of the whole drive by its odometry, also where it is not joined.
     """
 
     session: MapSession
@@ -38,6 +39,7 @@ class JointSession:
     stamps: Stamps
     poses: Array
     odometry: Array
+    path_length_m: float
 
 
 @dataclass(frozen=True)
@@ -101,11 +103,12 @@ def solve(folder: MapFolder, edits: Mapping[tuple[int, int], State] | None = Non
 
 def _placed(folder: MapFolder, session: MapSession, graph: PoseGraph, odometry: list[OdometrySample]) -> JointSession:
     """Return a session with the poses of its keyframes in the solved map."""
-    stamps = read_keyframes(folder.folder_of(session.name) / "keyframes.csv")["stamp_ns"]
+    keyframes = read_keyframes(folder.folder_of(session.name) / "keyframes.csv")
+    stamps, length_m = keyframes["stamp_ns"], np.ptp(np.nan_to_num(keyframes["path_length_m"])) if len(keyframes) else 0
     poses, known = graph.poses_at(stamps + session.shift_ns)
     own = Trajectory.rising((one.stamp_ns, one.odom_T_body) for one in sorted(odometry, key=lambda one: one.stamp_ns))
     by_odometry = own.at(stamps[known])[0] if own is not None else np.empty((0, 4, 4))
-    return JointSession(session, bool(known.any()), stamps[known], poses[known], by_odometry)
+    return JointSession(session, bool(known.any()), stamps[known], poses[known], by_odometry, float(length_m))
 
 
 def _shifted(closure: LoopClosure, shift_ns: int) -> LoopClosure:

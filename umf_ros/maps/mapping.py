@@ -24,6 +24,7 @@ from shutil import rmtree
 from typing import Any, NamedTuple
 
 from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.inputs import input_counts
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
@@ -42,8 +43,10 @@ from umf_ros.maps.outputs import write_results
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
-from umf_ros.runs.reader import describe_recording, remember_recording
-from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, closure_row
+from umf_ros.runs.findings import look_first
+from umf_ros.runs.reader import describe_recording, read_run, remember_recording
+from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, closure_row, read_odometry_of
+from umf_ros.runs.truth import JudgedRun
 from umf_ros.runs.writer import PLACES, begin_folder, count_drops, is_of, is_unfinished
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.submaps import SubmapFinder
@@ -113,7 +116,8 @@ def _is_recording(path: Path) -> bool:
 def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: OnFrame = lambda *_: None) -> None:
     """Replay one recording into a run folder; one of a process that was killed is continued.
 
-    Scans make the odometry where there is none. The folder gets `places.sqlite`, stamped by the recording's own clock.
+    Scans make the odometry where there is none. The folder gets `places.sqlite`, stamped by the recording's own clock,
+    and its summary the findings about the recording, worst first.
     `on_frame` is called for every frame.
     """
     bag = open_bag(recording)
@@ -125,14 +129,18 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
         rmtree(folder, ignore_errors=True)
         begin_folder(folder, recording)
     reader = FrameReader(bag, settings, _odometry(bag, opening, settings, folder))
-    replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)), resume)
+    detector = LoopDetector(settings, make_detector_embedder(settings))
+    replay = Replay(folder, settings, detector, resume)
     for detection in replay.run(reader.stream()):
         on_frame(reader.progress, detection)
     has_odometry = replay.finish(count_drops(reader.counters))
-    remember_recording(folder, bag)
+    sensors = detector.sensors.report(read_odometry_of(folder))
+    remember_recording(folder, bag, inputs=input_counts(reader.counters), sensors=sensors.as_json())
     replay.raise_if_frames_failed()
     if not has_odometry:
         raise BagError(f"{recording} has no usable odometry, {REMEDY}")
+    found = look_first(JudgedRun(read_run(folder), bag=bag, sensors=sensors))
+    remember_recording(folder, bag, findings=[one.line for one in found if one.severity != "note"])
 
 
 def _odometry(bag: Bag, opening: Opening, settings: Settings, folder: Path) -> Trajectory | None:

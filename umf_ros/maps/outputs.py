@@ -33,6 +33,7 @@ from umf_ros.places.store import stored_identity
 from umf_ros.pose_graph.closures import VERDICT_COLUMNS, State, verdict_rows
 from umf_ros.runs.report import render
 from umf_ros.runs.scene import HeightMap, data_address
+from umf_ros.runs.writer import read_summary
 from umf_ros.terrain.grid import write_terrain
 from umf_ros.terrain.voxels import REACH_M, PlacedScan, VoxelMap
 
@@ -66,6 +67,8 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     found, ground = write_cloud(folder, joint) if folder.places.is_file() else (dict.fromkeys(THICKNESS, nan), "")
     thickness = {name: None if isnan(value) else round(value, 4) for name, value in found.items()}
     summary = summarise(joint) | {"thickness_m": thickness, "ground": ground, "world": None}
+    for one in summary["sessions"]:
+        one["findings"] = _findings(folder.folder_of(one["name"]))
     if joint.world is not None:
         world_T_map, origin = joint.world
         summary["world"] = {"origin": origin.tolist(), "world_T_map": world_T_map.tolist()}
@@ -74,6 +77,11 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     write_atomically(path / "summary.json", json.dumps(summary, indent=2) + "\n")
     _write_report(path, summary)
     return summary
+
+
+def _findings(run: Path) -> list[str]:
+    """Return the findings about the recording of a session; none of a drive that no recording was replayed for."""
+    return read_summary(run).get("findings", []) if (run / "summary.json").is_file() else []
 
 
 def summarise(joint: JointMap) -> dict[str, Any]:
@@ -95,10 +103,16 @@ def summarise(joint: JointMap) -> dict[str, Any]:
 
 def sentence(summary: dict[str, Any]) -> str:
     """Return a sentence on joined sessions and closures between them; of a single one, on its own closures."""
+    within, between = (in_words(summary[f"closures_{where}"]) for where in ("within", "between"))
     if len(summary["sessions"]) == 1:
-        return "one session; {accepted} of {found} closures accepted".format_map(summary["closures_within"])
-    between, joined = summary["closures_between"], f"{summary['joined']} of {len(summary['sessions'])} sessions"
-    return f"{joined} in one frame; closures between them: {between['accepted']} of {between['found']} accepted"
+        return f"one session; its closures: {within}"
+    joined = f"{summary['joined']} of {len(summary['sessions'])} sessions"
+    return f"{joined} in one frame; closures between them: {between}; within them: {within}"
+
+
+def in_words(counts: dict[str, int]) -> str:
+    """Return the number of closures, and of those in each state that occurs; they add up."""
+    return ", ".join(f"{count} {state}" for state, count in counts.items() if count or state in ("found", "accepted"))
 
 
 def crispness(summary: dict[str, Any]) -> str:
@@ -112,7 +126,6 @@ def crispness(summary: dict[str, Any]) -> str:
 
 def _about(joint: JointMap, one: JointSession, ties: int) -> dict[str, Any]:
     session = one.session
-    steps = np.linalg.norm(np.diff(one.poses[:, :3, 3], axis=0), axis=1)
     spans = joint.graph.session_spans()
     return {
         "name": session.name,
@@ -120,7 +133,7 @@ def _about(joint: JointMap, one: JointSession, ties: int) -> dict[str, Any]:
         "places": session.places,
         "places_in_map": len(one.stamps),
         "joined": one.joined,
-        "length_m": round(float(steps.sum()), 1),
+        "length_m": round(one.path_length_m, 1),
         "closures_between": ties,
         "clock_shift_s": session.shift_ns // 10**9,
         "graph_sessions": [n for n, span in enumerate(spans) if span is not None and session.covers(span[0])],
@@ -129,7 +142,7 @@ def _about(joint: JointMap, one: JointSession, ties: int) -> dict[str, Any]:
 
 def _counts(verdicts: list[Any]) -> dict[str, int]:
     counts = Counter(verdict.state for verdict in verdicts)
-    return {"found": len(verdicts), **{state.value: counts[state] for state in (State.ACCEPTED, State.REJECTED)}}
+    return {"found": len(verdicts), **{state.value: counts[state] for state in State}}
 
 
 def _write_poses(path: Path, joint: JointMap) -> None:
@@ -177,10 +190,8 @@ def _write_report(folder: Path, summary: dict[str, Any]) -> None:
         "map.html",
         name=folder.resolve().name,
         sentence=sentence(summary),
-        mark="good" if joined == count else "warn",
+        mark="warn" if joined < count or any(one.get("findings") for one in summary["sessions"]) else "good",
         sessions=summary["sessions"],
-        between=summary["closures_between"],
-        within=summary["closures_within"],
         crispness=crispness(summary),
         **{name: data_address("image/png", p.read_bytes()) if p.is_file() else "" for name, p in pictures.items()},
     )

@@ -35,6 +35,7 @@ def command(
     The tables and trajectories of a run that was killed are exported first. With the recording or the truth of another
     run, nothing is written.
     """
+    _check_run(folder)
     check_files(bag or Path(), ground_truth)
 
     from rich.console import Console
@@ -50,6 +51,12 @@ def command(
             raise UmfError(f"{folder}: its recording is unknown or was moved; name it after the folder")
         opened = open_bag(recording)
     report_run(folder, opened, console, ground_truth)
+
+
+def _check_run(folder: Path) -> None:
+    """Check that a folder holds a run, which may have been killed, before large imports."""
+    if not any((folder / name).is_file() for name in ("summary.json", "run.sqlite")):
+        raise UmfError(f"{folder} holds no finished run: summary.json is missing")
 
 
 def recording_of(folder: Path) -> Path | None:
@@ -105,6 +112,7 @@ def why(
     Also prints the parameter that would accept it, and the effect on other closures. Reads the run folder only. Without
     a stamp, it lists the stages that rejected keyframes, those with most of them first.
     """
+    _check_run(folder)
     asked = None if moment is None else _moment(moment)
 
     from rich.console import Console

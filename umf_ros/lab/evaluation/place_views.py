@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -236,19 +237,15 @@ def parse_moment(text: str) -> Moment:
     Raises:
         ValueError: it is none of them.
     """
-    if text.isdigit() and len(text) >= 16:
+    if re.fullmatch(r"[0-9]{16,}", text):
         return int(text)
-    try:
-        value = float(text)
-    except ValueError:
-        raise ValueError(f"{text!r} is neither a stamp in ns nor seconds from the start") from None
-    if not value >= 0:
+    if not re.fullmatch(r"-?([0-9]+\.?[0-9]*|\.[0-9]+)", text):
+        raise ValueError(f"{text!r} is neither a stamp in ns nor seconds from the start")
+    if (value := float(text)) < 0:
         raise ValueError(f"{text!r} is before the start")
     if value < EPOCH_S:
         return value
     seconds, _, fraction = text.partition(".")
-    if not seconds.isdigit() or (fraction and not fraction.isdigit()):
-        raise ValueError(f"{text!r} is neither a stamp in ns nor seconds from the start")
     return int(seconds) * 10**9 + int(f"{fraction:0<9}"[:9])  # a float has no room for nanoseconds
 
 
