@@ -110,6 +110,17 @@ def test_normals_are_those_of_the_neighbours(scan: Array) -> None:
     assert not kernels.KdTree(scan[:4]).normals(scan[:4], 10).any()
 
 
+@pytest.mark.parametrize("rings, known", [(1, False), (2, True)])
+def test_a_single_ring_has_no_normals(rings: int, known: bool) -> None:
+    """On a wall 5 m away, with noise; the next ring is .35 m above."""
+    along, above = np.meshgrid(np.arange(-2, 2, 0.25), 0.35 * np.arange(rings))
+    wall = np.column_stack([np.full(along.size, 5.0), along.ravel(), above.ravel()])
+    wall += np.random.default_rng(0).normal(0, 0.01, wall.shape)
+    normals = kernels.KdTree(wall).normals(wall, 10, 0.1)
+    assert normals.any() == known
+    assert not known or np.median(-normals[:, 0]) > 0.95
+
+
 def test_planes_go_through_neighbourhoods(scan: Array) -> None:
     some = np.ascontiguousarray(scan[::5])
     centres, ways, reach, spread = kernels.KdTree(some).planes(8)

@@ -3,15 +3,15 @@
 Scans look much the same all along. The pattern of one sensor lies on floor, walls and ceiling in the same way wherever
 it stands. Points of two scans therefore coincide at the identity pose although the places differ, and an alignment of
 points that begins near it stays there. All positions along a passage are therefore compared, and a point's distance is
-that to a plane of the other scan. Of its planes those are asked that the other sensor scanned in every second band of
-elevations, between which the ray of the point lies: no ring meets itself, nor another that a tilt brings it to. Planes
-that face along the passage decide (`face_along`), and all planes (`locate_along`) where those do not.
+that to a plane of the other scan. Points of one half of a scan, every second band of elevations, are compared with
+planes of the other half alone: no ring meets itself. Planes that face along the passage decide (`face_along`), and all
+planes (`locate_along`) where those do not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Iterator
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -32,8 +32,8 @@ from umf_ros.verification.scan_consistency import (
     upright_sample,
 )
 
-Compared = tuple[Array, Array]
-"""Points (N, 3) of a query and of a match that are compared with the other scan."""
+Halves = tuple[list[Array], list[Array]]
+"""Points (N, 3) of each half of a query and of a match, the half first whose bands the first planes lie between."""
 Misfits = tuple[Array, NDArray[np.bool_]]
 """(K, N) of points at poses, from 0 on a surface to 1 off all or in space seen empty; and whether they are known."""
 
@@ -132,7 +132,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     if way is None:
         return None
     along = shifted(pose, way, const.PASSAGE_SHIFTS_M)
-    best = along[_peaks(_means(*_misfits(match, query, along, _sample(match, query, const.SCOUT_EVERY))))]
+    best = along[_peaks(_means(*_misfits(match, query, along, _halves(match, query, const.SCOUT_EVERY))))]
     distinct: list[tuple[Array, Array]] = []
     for one in best:  # half of them end where another does: a few points show it
         end = run_gicp(match, query.oriented_scouts, one, const.FINE_REACH_M)
@@ -140,11 +140,11 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
             distinct.append((one, end))
     aligned = [run_gicp(match, query.oriented_sample, one, const.FINE_REACH_M) for one, _ in distinct]
     poses = np.stack([pose, *aligned, *best])  # alignments may all end at one pose
-    misfits, known = _misfits(match, query, poses, _sample(match, query))
+    misfits, known = _misfits(match, query, poses, _halves(match, query))
     means = _means(misfits, known)
     rivals = Rivals(poses, means, misfits, known)
     first = int(np.argmin(means[: 1 + len(aligned)]))
-    metre = _metres(_sample(match, query), way, poses[first])
+    metre = _metres(_halves(match, query), way, poses[first])
     found = PassagePosition(poses[first], way, means[first], misfits[first], known[first], metre, rivals)
     elsewhere = found.elsewhere
     if not elsewhere.any():
@@ -162,8 +162,8 @@ def undisputed(found: PassagePosition, match: PreparedScan, query: PreparedScan,
     comparison found.
     """
     rivals = found.rivals
-    misfits, known = _misfits(match, query, pose[None], _sample(match, query))
-    metre = _metres(_sample(match, query), found.way, pose)
+    misfits, known = _misfits(match, query, pose[None], _halves(match, query))
+    metre = _metres(_halves(match, query), found.way, pose)
     here = found._replace(pose=pose, misfits=misfits[0], known=known[0], metre=metre)
     elsewhere = here.elsewhere
     needed = const.UNDISPUTED_SIGMAS if known.mean() > const.PASSAGE_KNOWN else 0.0
@@ -233,9 +233,9 @@ def face_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: bo
     way = passage_way(match, query, pose)
     if way is None:
         return None
-    points = _facing(query, pose[:3, :3].T @ way), _facing(match, way)
+    halves = _facing(query, pose[:3, :3].T @ way), _facing(match, way)
     poses = np.concatenate([pose[None], shifted(pose, way, const.FACING_SHIFTS_M)])
-    misfits, known = _misfits(match, query, poses, points, const.FACING_SIGMA_M)
+    misfits, known = _misfits(match, query, poses, halves, const.FACING_SIGMA_M)
     counts = known.sum(axis=1)
     fits = np.log(misfits.sum(axis=1) / np.maximum(counts, 1) + const.MISFIT_FLOOR)
     rivals = 1 + np.flatnonzero(counts[1:] >= max(const.FEWEST_FACING, const.PASSAGE_COMMON * counts[0]))
@@ -244,7 +244,7 @@ def face_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: bo
     best = rivals[fits[rivals].argmin()]
     # what repeats is seen here, and there from another side: the same points have to tell both apart
     told = np.where(known[rivals] & known[0], misfits[rivals] - misfits[0], 0.0)
-    metres = _by_metre(told, _metres(points, way, pose))
+    metres = _by_metre(told, _metres(halves, way, pose))
     evidence = metres.sum(axis=1) - (metres.max(axis=1) if turned else 0.0)
     worse, better = float(fits[best] - fits[0]), poses[best] if fits[best] < fits[0] else None
     return FacedPosition(pose, way, float(fits[0]), worse, float(evidence.min()), better)
@@ -266,7 +266,7 @@ class StandingEvidence(NamedTuple):
     @property
     def supports(self) -> bool:
         """Whether it fits at the pose alone."""
-        decides = self.lead >= const.STANDING_LEAD and self.points >= const.STANDING_POINTS
+        decides = self.lead >= const.PASSAGE_LEAD and self.points >= const.STANDING_POINTS
         return decides and self.tilt_lead >= const.TILT_LEAD
 
     @property
@@ -289,16 +289,22 @@ def stand_out(match: PreparedScan, query: PreparedScan, pose: Array) -> Standing
         pose: (4, 4) `match_T_query`.
     """
     way = passage_way(match, query, pose)
-    points = _standing(query), _standing(match)
-    if way is None or not all(map(len, points)):
+    halves = _standing(query), _standing(match)
+    if way is None or not all(map(len, chain(*halves))):
         return StandingEvidence(0.0, 0.0, 0.0)
-    middle = np.concatenate([transform(pose, points[0]), points[1]]).mean(axis=0)
+    middle = np.concatenate([*(transform(pose, half) for half in halves[0]), *halves[1]]).mean(axis=0)
     across = np.cross(match.up[2], way)
     turns = Rotation.from_rotvec(const.TILTS_RAD[:, None] * across / np.linalg.norm(across)).as_matrix()
     tilted = [make_pose(turn, middle - turn @ middle) @ pose for turn in turns]
     poses = np.concatenate([pose[None], tilted, shifted(pose, way, const.STANDING_SHIFTS_M)])
-    misfits = _of_opposite(match, query, poses, points, _point_misfits).astype(float)
-    misfits = misfits[:, np.isfinite(misfits[0])]
+    misfits = np.concatenate(
+        [
+            scan.free_space.point_misfits(half.tree, points, np.full(len(points), const.THIN_CELL_M), at, 1.0)
+            for scan, half, points, at in _opposite(match, query, poses, halves)
+        ],
+        axis=1,
+    )
+    misfits = misfits[:, np.isfinite(misfits[0])].astype(float)
     known = np.isfinite(misfits)
     there = np.where(known, misfits, 0.0)
     along = slice(1 + len(tilted), None)
@@ -311,33 +317,33 @@ def stand_out(match: PreparedScan, query: PreparedScan, pose: Array) -> Standing
     return StandingEvidence(float(leads[along].min()), float(worse[along].sum(axis=1).min()), tilt_lead)
 
 
-def _standing(scan: PreparedScan) -> Array:
-    """(N, 3) some points of each half of a scan that are off its walls and its ground."""
+def _standing(scan: PreparedScan) -> list[Array]:
+    """Some points (N, 3) of each half of a scan, as in `Halves`, that are off its walls and its ground."""
     walls, found = largest_walls(*upright_sample(scan)), []
     height = scan.points @ scan.up[2]
-    ground_m = np.quantile(height, const.GROUND_SHARE) + const.STANDING_M
-    for half in scan.surfaces:
+    ground_m = np.quantile(height, const.GROUND_SHARE) + const.THIN_CELL_M
+    for half in reversed(scan.surfaces):
         level = half.planar & (np.abs(half.normals @ scan.up[2]) > const.LEVEL_COS)
         near = half.reach_m < const.STANDING_REACH_M
         stands = near & ~level & off_walls(half.points, walls, 2 * const.WALL_M) & (half.points @ scan.up[2] > ground_m)
         points = half.points[stands]
-        found.append(points[evenly(len(points), const.STANDING_SAMPLE)])
-    return np.concatenate(found)
+        found.append(np.ascontiguousarray(points[evenly(len(points), const.STANDING_SAMPLE)]))
+    return found
 
 
-def _facing(scan: PreparedScan, way: Array) -> Array:
-    """(N, 3) some points of each half of a scan on planes that face along a direction (3,)."""
+def _facing(scan: PreparedScan, way: Array) -> list[Array]:
+    """Some points (N, 3) of each half of a scan, as in `Halves`, on planes that face along a direction (3,)."""
     found = []
-    for half in scan.surfaces:
+    for half in reversed(scan.surfaces):
         points = half.points[half.planar & (np.abs(half.normals @ way) > const.FACING_COS)]
         found.append(points[evenly(len(points), const.FACING_POINTS)])
-    return np.concatenate(found)
+    return found
 
 
-def _metres(points: Compared, way: Array, pose: Array) -> NDArray[np.int64]:
+def _metres(halves: Halves, way: Array, pose: Array) -> NDArray[np.int64]:
     """(N,) of each point of both scans along a passage, from 0 on, at a pose (4, 4) `match_T_query`."""
-    ours, theirs = points
-    metre = np.floor(np.concatenate([transform(pose, ours), theirs]) @ way).astype(np.int64)
+    ours, theirs = halves
+    metre = np.floor(np.concatenate([*(transform(pose, half) for half in ours), *theirs]) @ way).astype(np.int64)
     return metre - metre.min(initial=0)
 
 
@@ -347,49 +353,36 @@ def _by_metre(values: Array, metre: NDArray[np.int64]) -> Array:
 
 
 def _misfits(
-    match: PreparedScan, query: PreparedScan, poses: Array, points: Compared, least_m: float = const.PLANE_SIGMA_M
+    match: PreparedScan, query: PreparedScan, poses: Array, halves: Halves, least_m: float = const.PLANE_SIGMA_M
 ) -> Misfits:
     """Misfits of points of both scans with surfaces of the other at poses (K, 4, 4) `match_T_query`.
 
     Their standard deviation is `least_m` at least.
     """
     sigma_m = max(const.PLANE_SIGMA_M + 2 * common_blur(match, query), least_m)
-    misfits = _of_opposite(match, query, poses, points, partial(_plane_misfits, sigma_m=sigma_m))
+    parts = [
+        _misfits_with(scan, planes, points, at, sigma_m)
+        for scan, planes, points, at in _opposite(match, query, poses, halves)
+    ]
+    misfits, known = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
+    return misfits, known
+
+
+def _opposite(
+    match: PreparedScan, query: PreparedScan, poses: Array, halves: Halves
+) -> Iterator[tuple[PreparedScan, Surfaces, Array, Array]]:
+    """Yield both scans, each of their halves, the other scan's points (N, 3) for it, and their poses (K, 4, 4)."""
+    for scan, others, at in zip((match, query), halves, (poses, invert(poses)), strict=True):
+        for half, points in zip(scan.surfaces, others, strict=True):
+            yield scan, half, points, at
+
+
+def _misfits_with(scan: PreparedScan, planes: Surfaces, points: Array, poses: Array, sigma_m: float) -> Misfits:
+    """Misfits of points (N, 3) with planes of a scan."""
+    planar = planes.centres, planes.normals, planes.reach_m, planes.planar
+    misfits = scan.free_space.plane_misfits(planes.tree, *planar, points, poses, sigma_m, const.PLANE_REACH_M)
     known = np.isfinite(misfits)
     return np.where(known, misfits, 0.0), known
-
-
-def _of_opposite(
-    match: PreparedScan, query: PreparedScan, poses: Array, points: Compared, misfits_with: Callable[..., Array]
-) -> Array:
-    """(K, N) misfits of points of both scans, each with the half of the other scan that its ray does not lie in.
-
-    By the bands of its own sensor, a ray would meet rings where one sensor is tilted by the angle between two of them.
-    All poses (K, 4, 4) `match_T_query` are taken to be turned as the first.
-    """
-    found = []
-    for scan, other, seen, at in zip((match, query), (query, match), points, (poses, invert(poses)), strict=True):
-        rays = (seen - other.lidars[0]) @ at[0, :3, :3].T
-        odd = scan.in_odd_band(rays, np.zeros(len(rays), np.intp))
-        misfits = np.empty((len(at), len(seen)))
-        for half, rows in zip(scan.surfaces, (odd, ~odd), strict=True):
-            misfits[:, rows] = misfits_with(scan, half, np.ascontiguousarray(seen[rows]), at)
-        found.append(misfits)
-    return np.concatenate(found, axis=1)
-
-
-def _plane_misfits(scan: PreparedScan, half: Surfaces, points: Array, poses: Array, sigma_m: float) -> Array:
-    """(K, N) misfits of points (N, 3) with planes of a scan; NaN where unknown."""
-    planar = half.centres, half.normals, half.reach_m, half.planar
-    found: Array = scan.free_space.plane_misfits(half.tree, *planar, points, poses, sigma_m, const.PLANE_REACH_M)
-    return found
-
-
-def _point_misfits(scan: PreparedScan, half: Surfaces, points: Array, poses: Array) -> Array:
-    """The same with points of a scan."""
-    reach_m = np.full(len(points), const.STANDING_M)
-    found: Array = scan.free_space.point_misfits(half.tree, points, reach_m, poses, 1.0)
-    return found
 
 
 def _means(misfits: Array, known: NDArray[np.bool_]) -> Array:
@@ -407,11 +400,10 @@ def _peaks(means: Array) -> list[int]:
     return picks
 
 
-def _sample(match: PreparedScan, query: PreparedScan, every: int = 1) -> Compared:
-    """One in so many points of a sample of each half of a query and of a match."""
+def _halves(match: PreparedScan, query: PreparedScan, every: int = 1) -> Halves:
+    """One in so many points of a sample of each half."""
 
-    def of(scan: PreparedScan) -> Array:
-        halves = [half.points[evenly(len(half.points), const.SAMPLE // 2)[::every]] for half in scan.surfaces]
-        return np.concatenate(halves)
+    def of(scan: PreparedScan) -> list[Array]:
+        return [half.points[evenly(len(half.points), const.SAMPLE // 2)[::every]] for half in reversed(scan.surfaces)]
 
     return of(query), of(match)

@@ -259,16 +259,13 @@ class PreparedScan:
         away = np.abs(np.einsum("nki,ni->nk", offsets, self.sample_normals))
         return 1.4826 * float(np.median(away))
 
-    def in_odd_band(self, rays: Array, owner: Indices) -> NDArray[np.bool_]:
-        """(N,) whether rays (N, 3), body frame, lie in an odd one of the bands of elevations of a merged scan (N,)."""
-        seen = np.einsum("nij,nj->ni", self._lidars_T_body[owner, :3, :3], rays)
-        elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
-        return np.asarray(np.floor(elevation / const.SIGHT_DEG) % 2 == 1)
-
     @cached_property
     def surfaces(self) -> tuple[Surfaces, Surfaces]:
         """Planes through the points of every second band of elevations, and through those between."""
-        odd = self.in_odd_band(self.points - self.lidars[self.owner], self.owner)
+        poses = self._lidars_T_body[self.owner]
+        seen = np.einsum("nij,nj->ni", poses[:, :3, :3], self.points) + poses[:, :3, 3]
+        elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
+        odd = (np.floor(elevation / const.SIGHT_DEG) % 2).astype(bool)
         return Surfaces.of(self.points[~odd]), Surfaces.of(self.points[odd])
 
     @cached_property

@@ -276,8 +276,8 @@ class Verifier:
         """Whether the pose of a hypothesis holds against all others along a passage."""
         (theirs, ours), (query, match), pose = hypothesis.scans, hypothesis.keyframes, hypothesis.pose
         standing = stand_out(theirs, ours, pose)
-        # rows of goods look alike from either end
-        if standing.supports and not _is_turned(query, match, pose):
+        # rows of goods look alike from either end; where planes tell positions, nothing before them overrules these
+        if standing.supports and found.known.mean() < const.STANDING_KNOWN and not _is_turned(query, match, pose):
             return True
         return not standing.contradicts and undisputed(found, theirs, ours, pose)
 

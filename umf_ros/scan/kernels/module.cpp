@@ -79,13 +79,12 @@ nb::tuple neighbours(const KdTree& tree, const Points& queries, int wanted) {
 
 nb::object normals(const KdTree& tree, const Points& places, int wanted, double width) {
   require(0 < wanted && wanted <= KdTree::kMostNeighbours, "1 to 32 neighbours");
-  const size_t count = places.shape(0);
-  Out<double> found(3 * count);
+  Out<double> found(3 * places.shape(0));
   {
     nb::gil_scoped_release free;
-    normals_at(tree, places.data(), count, wanted, width, found.data);
+    normals_at(tree, places.data(), places.shape(0), wanted, width, found.data);
   }
-  return nb::cast(found.of({count, 3}));
+  return nb::cast(found.of({places.shape(0), 3}));
 }
 
 nb::tuple planes(const KdTree& tree, int wanted) {

@@ -40,14 +40,13 @@ struct Neighbourhood {
 
 // Unit normals (N, 3) at N places among the points of a tree, towards the origin; zero with fewer than five neighbours,
 // and where these lie on a line: with less than `width` of the standard deviation along it across.
-inline void normals_at(const KdTree& tree, const double* places, int64_t count, int wanted, double width,
-                       double* normals) {
+inline void normals_at(const KdTree& tree, const double* places, int64_t count, int wanted, double width, double* out) {
   for (int64_t i = 0; i < count; ++i) {
     const Vec3 at = row(places, i);
     const Neighbourhood around(tree, at, wanted);
-    const bool flat = around.count >= 5 && around.variances[1] >= width * width * around.variances[2];
-    const double sign = !flat ? 0.0 : dot(around.normal, at) > 0 ? -1.0 : 1.0;
-    for (int k = 0; k < 3; ++k) normals[3 * i + k] = sign * around.normal[k];
+    const bool line = around.count < 5 || around.variances[1] < width * width * around.variances[2];
+    const double sign = line ? 0.0 : dot(around.normal, at) > 0 ? -1.0 : 1.0;
+    for (int k = 0; k < 3; ++k) out[3 * i + k] = sign * around.normal[k];
   }
 }
 
