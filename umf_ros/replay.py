@@ -31,8 +31,9 @@ FLEET_PATIENCE_S = 30.0
 class Replay:
     """Replay: feeds frames to the detector, odometry and closures to the pose graph, and writes a run folder.
 
-    The graph gets the inputs of the live back-end: every odometry message, and one closure after the other. With
-    settings of mode localization, a `Localizer` takes the place of the graph, as live.
+    The graph gets the inputs of the live back-end: every odometry message and every closure. It decides about each
+    closure once, in the order of stamps. With settings of mode localization, a `Localizer` takes the place of the
+    graph, as live.
 
     Args:
         folder: run folder.
@@ -95,7 +96,7 @@ class Replay:
             if detection.keyframe is not None and self._done:
                 self._done -= 1
             self._recorder.record(item, detection)
-            self._add_closures(detection.closures)
+            self._graph.receive(detection.closures)
             if self._localizer is not None and detection.keyframe is not None:
                 self._record_pose(self._localizer)
             while (inter_closure := self._detector.next_inter_robot_closure()) is not None:
@@ -116,10 +117,6 @@ class Replay:
                 file.write(f"frame {frame.stamp_ns}\n{traceback.format_exc()}\n")
             return Detection(frame.stamp_ns)
 
-    def _add_closures(self, closures: Iterable[LoopClosure]) -> None:
-        for closure in closures:
-            self._graph.add_closure(closure)
-
     def raise_if_frames_failed(self) -> None:
         """Report skipped frames, once everything else is written.
 
@@ -131,7 +128,8 @@ class Replay:
             raise UmfError(f"{self.faults} frames skipped after internal errors: please report {log}")
 
     def graph_counts(self) -> dict[str, int]:
-        """Return the number of closures by state so far; none without odometry."""
+        """Decide about the closures so far, and return their number by state; none without odometry."""
+        self._graph.prepare(float("inf"))
         verdicts = self._graph.verdict_counts() if self._has_odometry else {}
         return {state.value: count for state, count in verdicts.items()}
 
@@ -145,7 +143,7 @@ class Replay:
         self._recorder.count(frame)
         if self._detector.resume(frame):
             self._done -= 1
-            self._add_closures(self._earlier.get(frame.stamp_ns, ()))
+            self._graph.receive(self._earlier.get(frame.stamp_ns, []))
         return Detection(frame.stamp_ns)
 
     def _record_pose(self, localizer: Localizer) -> None:

@@ -118,13 +118,18 @@ class AbsoluteReference:
         else:
             self._refused.append(AbsoluteVerdict(*key, State.REFUSED, AbsoluteReason.UNUSABLE))
 
+    @property
+    def is_used(self) -> bool:
+        """Whether there are measurements, or an elevation model."""
+        return bool(self._known) or self._model is not None
+
     def decide(self, paths: Sessions, solve: Callable[[], None], at_last: bool = False) -> None:
         """Decide about all measurements, and `solve` the graph if the accepted ones have changed.
 
         Raises:
             GraphError: it cannot be solved.
         """
-        if not self._known and self._model is None:
+        if not self.is_used:
             return
         late = self._place(paths)
         seen = tuple(_finished(paths.chains[session])[0] for session in paths.begun), tuple(paths.components)

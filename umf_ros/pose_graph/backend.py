@@ -33,7 +33,7 @@ from umf_ros.pose_graph.closures import (
     verdict_rows,
 )
 from umf_ros.pose_graph.consistency import NoiseScale
-from umf_ros.pose_graph.odometry import POINT, PathPoints, Rows, Stamps
+from umf_ros.pose_graph.odometry import POINT, PathPoints, Stamps
 from umf_ros.pose_graph.rejection import OutlierRejection
 from umf_ros.pose_graph.sessions import Sessions
 from umf_ros.pose_graph.solver import Graph
@@ -126,7 +126,7 @@ class PoseGraph:
         """
         self._refresh()
         stamps = np.array([closure.pair for closure in closures], np.int64).reshape(-1, 2)
-        both = zip(closures, *self._find(stamps), strict=True)
+        both = zip(closures, *self._sessions.find_pairs(stamps), strict=True)
         return [verdict for one in both if (verdict := self._receive(*one)) is not None]
 
     def resume(self, verdicts: Mapping[tuple[int, int], Decision], within_s: float = float("inf")) -> None:
@@ -137,7 +137,6 @@ class PoseGraph:
         """
         for key in [key for key in self._waiting if verdicts.get(key[:2], (None,))[0] is State.REFUSED]:
             self._refuse(self._waiting.pop(key)[0], verdicts[key[:2]][1])
-        self._place_waiting()
         self._refuse_waiting()
         times, decided, new = Counter(placed.closure.pair for placed in self._arrived), [], []
         for placed in self._arrived:
@@ -158,7 +157,6 @@ class PoseGraph:
 
         When the time is up, closures are left, and the map is not solved exactly.
         """
-        self._place_waiting()
         verdicts = self._refuse_waiting() + self.decide(within_s)
         self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve))
         if exactly and not self._arrived:
@@ -193,8 +191,7 @@ class PoseGraph:
         last_ns = [chain.stamps[-1:] for chain in self._sessions.chains]
 
         def has_odometry_beyond(one: PlacedClosure) -> bool:
-            ends = (one.match, one.closure.match_stamp_ns), (one.query, one.closure.query_stamp_ns)
-            return all((last_ns[session] > stamp_ns).all() for session, stamp_ns in ends)
+            return all((last_ns[session] > ns).all() for session, ns in zip(one[:2], one.closure.pair, strict=True))
 
         worlds = dict(self.reference.worlds)
         self._reprocess(within_s, has_odometry_beyond)
@@ -210,20 +207,21 @@ class PoseGraph:
             The changed verdicts; None when the time was up first, and nothing has changed.
         """
         until_s = time.monotonic() + within_s
-        verdicts = self.update(within_s=within_s)
+        once = self._decides_once and within_s == float("inf")
+        verdicts = self._refuse_waiting() if once else self.update(within_s=within_s)
         if self._settled:  # no input since
             return verdicts
-        before = self._rejection
-        if self._arrived or not self._reprocess(until_s - time.monotonic()) or self._ordered is None:
+        before, undecided = self._rejection, self._arrived and not once
+        if undecided or not self._reprocess(until_s - time.monotonic()) or self._ordered is None:
             return None
-        (_, self._sessions, self._rejection), self._ordered = self._ordered, None
+        (_, self._sessions, self._rejection), self._ordered, self._arrived = self._ordered, None, []
         rows = {id(placed): row for row, placed in enumerate(self._rejection.placed)}
         for row in before.by_hand:
             again, state = rows[id(before.placed[row])], before.verdicts[row].state
             self._attempt(lambda: self._rejection.decide_by_hand(again, state))  # noqa: B023 (called at once)
         states = {id(placed): verdict.state for placed, verdict in zip(before.placed, before.verdicts, strict=True)}
         after = zip(self._rejection.placed, self._rejection.verdicts, strict=True)
-        verdicts += [verdict for placed, verdict in after if verdict.state is not states[id(placed)]]
+        verdicts += [verdict for placed, verdict in after if verdict.state is not states.get(id(placed))]
         verdicts += self._attempt(self._rejection.settle)
         for _ in range(3):  # the map moved by measurements may contradict others
             self._attempt(lambda: self.reference.decide(self._sessions, self._rejection.solve, at_last=True))
@@ -232,10 +230,15 @@ class PoseGraph:
         self._settled = True
         return verdicts
 
+    @property
+    def _decides_once(self) -> bool:
+        """Whether no decision depends on the order of arrival so far: closures were received only, as in a replay."""
+        return not (self._rejection.placed or self._by_hand or self.reference.is_used)
+
     def _reprocess(self, within_s: float, is_ready: Callable[[PlacedClosure], bool] = lambda _: True) -> bool:
         """Decide again, from the odometry alone, by the stamps of query and match; return false if out of time."""
         until_s = time.monotonic() + within_s
-        order = sorted(self._rejection.placed, key=lambda placed: placed.closure.pair[::-1])
+        order = sorted(self._rejection.placed + self._arrived, key=lambda placed: placed.closure.pair[::-1])
         begun, sessions, rejection = self._ordered or (None, self._sessions, self._rejection)
         late = any(a is not b for a, b in zip_longest(rejection.placed, order[: len(rejection.placed)]))
         if late or begun != self._sessions.begun:
@@ -301,11 +304,6 @@ class PoseGraph:
             self.decide_by_hand(*closure.pair, State.REJECTED)
             raise
 
-    def _find(self, stamps: Stamps) -> tuple[Rows, Rows]:
-        """Return the sessions (N,) of the matches and the queries of closures with (N, 2) stamps, -1 without one."""
-        queries = self._sessions.find(stamps[:, 1])
-        return self._sessions.find(stamps[:, 0], before=queries), queries
-
     def _receive(self, closure: LoopClosure, match: int, query: int) -> ClosureVerdict | None:
         """Queue a closure of two sessions; return its first verdict, None if it is known."""
         key = *closure.pair, closure.match_T_query.tobytes()
@@ -353,14 +351,15 @@ class PoseGraph:
     def _place_waiting(self) -> None:
         """Queue closures whose odometry has arrived for their decision."""
         self._refresh()
-        sessions = self._find(np.array([key[:2] for key in self._waiting], np.int64).reshape(-1, 2))
+        sessions = self._sessions.find_pairs(np.array([key[:2] for key in self._waiting], np.int64).reshape(-1, 2))
         for key, match, query in zip(list(self._waiting), *(found.tolist() for found in sessions), strict=True):
             if min(match, query) >= 0:
                 placed = PlacedClosure(match, query, self._waiting.pop(key)[0])
                 self.counts["closure twice"] += not self._place(key, placed)
 
     def _refuse_waiting(self) -> list[ClosureVerdict]:
-        """Return refusals of closures that wait for too long, and of the oldest ones when too many wait."""
+        """Queue closures whose odometry has arrived; refuse those that wait too long, the oldest when too many wait."""
+        self._place_waiting()
         oldest_ns, now = min((span[0] for span in self.session_spans() if span), default=None), self._now
         waiting, self._waiting = self._waiting, {}
         refused, too_many = list[ClosureVerdict](), len(waiting) - MAX_WAITING
@@ -398,9 +397,10 @@ class PoseGraph:
 
     def verdict_counts(self) -> Counter[State]:
         """Return the number of closures by state."""
-        pending, refused = len(self._arrived) + len(self._waiting), self._number_refused
-        known = {State.PENDING: pending, State.REFUSED: refused}
-        return Counter(verdict.state for verdict in self._rejection.verdicts) + Counter(known)
+        ordered = self._ordered[2].verdicts if self._ordered and self._decides_once else self._rejection.verdicts
+        arrived = len(self._rejection.placed) + len(self._arrived) - len(ordered)
+        known = {State.PENDING: arrived + len(self._waiting), State.REFUSED: self._number_refused}
+        return Counter(verdict.state for verdict in ordered) + Counter(known)
 
     def trajectory(self, optimized: bool = True) -> tuple[Stamps, Array]:
         """Return stamps (N,) in ns and `map_T_body` or `odom_T_body` (N, 4, 4) of every keyframe joined to the map."""

@@ -96,6 +96,11 @@ class Sessions:
             found[chain.covers(stamps) & (before is None or session <= before)] = session
         return found
 
+    def find_pairs(self, stamps: Stamps) -> tuple[Rows, Rows]:
+        """Return the sessions (N,) of the matches and the queries of closures with (N, 2) stamps, -1 without one."""
+        queries = self.find(stamps[:, 1])
+        return self.find(stamps[:, 0], before=queries), queries
+
     def members(self, component: int) -> list[int]:
         """Return sessions with odometry of one component, which has the number of its earliest session."""
         return [session for session in self.begun if self.components[session] == component]

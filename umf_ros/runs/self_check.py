@@ -151,8 +151,7 @@ def judge(
     """Judge closures by the odometry of sessions and by scans (N, 3) at keyframes, body frame."""
     sessions.update()
     stamps = np.array([closure.pair for closure in closures], np.int64).reshape(-1, 2)
-    queries = sessions.find(stamps[:, 1])
-    matches = sessions.find(stamps[:, 0], before=queries)
+    matches, queries = sessions.find_pairs(stamps)
     rows = np.flatnonzero(np.minimum(matches, queries) >= 0).tolist()
     placed = [PlacedClosure(int(matches[row]), int(queries[row]), closures[row]) for row in rows]
     known = [as_closures(one, number, sessions.chains) for number, one in enumerate(placed)]

@@ -147,7 +147,7 @@ def odometry_noise(history: Trajectory, duration_ns: int) -> Array:
 def twists(poses: Array, lag: int = 1) -> Array:
     """Return steps (N - lag, 6) x y z rx ry rz between poses (N, 4, 4), about the axes of each pair's first pose."""
     moved = invert(poses[:-lag]) @ poses[lag:]
-    return np.hstack([moved[:, :3, 3], Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()])
+    return np.hstack([moved[:, :3, 3], Rotation.from_matrix(moved[:, :3, :3], assume_valid=True).as_rotvec()])
 
 
 MOST = 0.8
@@ -417,7 +417,7 @@ def deskew(points: Points, point_stamps_ns: NDArray[np.int64], path: Trajectory,
     uniform; before the first and after the last the rover is assumed to stand.
     """
     moved = invert(path_T_body) @ path.poses
-    turns = Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()
+    turns = Rotation.from_matrix(moved[:, :3, :3], assume_valid=True).as_rotvec()
     # relative to the first stamp: nanoseconds since the epoch do not fit a float
     times = (path.stamps_ns - path.stamps_ns[0]).astype(float)
     at = (point_stamps_ns - path.stamps_ns[0]).astype(float)

@@ -239,7 +239,8 @@ def _pairs_at(steps: list[Step], odometry: Trajectory, lag_s: float, at_least: i
         return None
     first, last = (interpolated(odometry.stamps_ns, odometry.poses, stamps) for stamps in spans_ns[inside].T)
     moved = invert(first) @ last
-    turns = np.stack([step.turn for step in steps])[inside], Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()
+    turned = Rotation.from_matrix(moved[:, :3, :3], assume_valid=True).as_rotvec()
+    turns = np.stack([step.turn for step in steps])[inside], turned
     levers = np.stack([step.lever for step in steps])[inside]
     shifted = np.einsum("nij,nj->ni", moved[:, :3, :3], levers) + moved[:, :3, 3] - levers
     shifts = np.stack([step.shift for step in steps])[inside], shifted
