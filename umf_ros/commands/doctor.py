@@ -21,7 +21,7 @@ TIMEOUT_S = 60
 
 _PACKAGES = {
     "numpy": ("numpy", "1.26"),
-    "scipy": ("scipy", "1.16"),
+    "scipy": ("scipy", "1.17"),
     "cv2": ("opencv-python-headless", "4.10"),
     "safetensors": ("safetensors", "0.4"),
     "small_gicp": ("small_gicp", "1"),
