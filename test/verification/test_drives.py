@@ -73,9 +73,9 @@ def test_worlds_take_turns_in_family_and_aliasing() -> None:
 def test_kept_drives_are_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
 
-    def simulate(seed: int, family: str, aliasing: float, step_m: float) -> SurveyedDrive:
+    def simulate(seed: int, family: str, aliasing: float) -> SurveyedDrive:
         made.append(seed)
-        return before_a_wall(np.eye(4), turned(10.0, step_m))
+        return before_a_wall(np.eye(4), turned(10.0, 2.4))
 
     monkeypatch.setattr("umf_ros.lab.simulation.drives.simulate", simulate)
     first, again = (kept(tmp_path / "drives", 20_000, "etna", 1.0) for _ in range(2))
