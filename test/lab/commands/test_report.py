@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
 import json
 import re
 from dataclasses import replace
@@ -16,6 +15,7 @@ import pytest
 from command_line import Ended, only_line, umf
 from conftest import make_keyframe
 from recordings import CLOUD, LEFT, START_NS, TRUTH, drive, small_settings, traverse, write_mcap
+from sources import rows_of as csv_rows
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
@@ -134,8 +134,7 @@ def test_sensors_that_the_replay_checked_are_not_checked_again(run: Path, bag: P
 def test_the_page_shows_every_closure_with_pictures_scans_and_errors(run: Path, bag: Path) -> None:
     report(run, bag)
     scene = scene_of(run)
-    with (run / "closures.csv").open() as file:
-        written = [[row["query_stamp_ns"], row["match_stamp_ns"]] for row in csv.DictReader(file)]
+    written = [[row["query_stamp_ns"], row["match_stamp_ns"]] for row in csv_rows(run / "closures.csv")]
     pairs = [pair for pair in scene["pairs"] if pair["number"]]
     assert [pair["stamps"] for pair in pairs] == written
     assert [pair["kind"] for pair in pairs] == ["accepted", "accepted", "false"]
