@@ -1,8 +1,9 @@
-"""Sources of the package, read and not run."""
+"""Sources of the package, read and not run; commands and tables of tests."""
 
 from __future__ import annotations
 
 import ast
+import csv
 import subprocess
 import tomllib
 from functools import cache
@@ -25,6 +26,12 @@ def imports(path: Path) -> list[str]:
         elif isinstance(node, ast.ImportFrom):
             names.append(node.module or "")
     return names
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file by column."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
 def requirements(*parts: str) -> dict[str, Requirement]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import multiprocessing
 import os
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from command_line import umf
 from recordings import small_settings, traverse, write_mcap
+from sources import rows_of
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import open_bag
@@ -80,8 +80,7 @@ def names_in(folder: Path) -> list[str]:
 
 
 def keyframes_in(folder: Path) -> list[dict[str, str]]:
-    with (folder / "keyframes.csv").open() as file:
-        return list(csv.DictReader(file))
+    return rows_of(folder / "keyframes.csv")
 
 
 def test_a_whole_run_leaves_tables_trajectories_and_graph(folder: Path, settings: Settings, stream: Stream) -> None:

@@ -27,13 +27,13 @@ from rich.table import Table
 
 from umf_ros.core.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
-from umf_ros.core.geometry import Array, heading, wrap_angle
+from umf_ros.core.geometry import Array, heading, relative, wrap_angle
 from umf_ros.embedding import make_embedder
-from umf_ros.lab.fit.acceptance import inside_ellipsoid
 from umf_ros.lab.simulation.drives import SurveyedDrive, embedded, kept, worlds
 from umf_ros.lab.simulation.scenes import TRAPS, spring
 from umf_ros.lab.simulation.world import TEST
 from umf_ros.places.database import PlaceDatabase, is_past
+from umf_ros.runs.truth import normalised_errors, pose_error, share_inside
 from umf_ros.verification import Verifier
 
 WRONG_M, WRONG_DEG = 1.0, 5.0
@@ -139,7 +139,8 @@ def _record(
         match = index[closure.match_stamp_ns]
         error = drive.error(query, match, closure.match_T_query)
         result.errors.append(error)
-        result.vectors.append(drive.error_vector(query, match, closure.match_T_query))
+        true = relative(drive.truth[match], drive.truth[query])
+        result.vectors.append(pose_error(closure.match_T_query, true))
         result.covariances.append(closure.covariance)
         right |= error[0] <= WRONG_M and error[1] <= WRONG_DEG
     revisited = _revisited(drive, query)
@@ -166,7 +167,7 @@ def _figures(results: list[World]) -> dict[str, float]:
     if not len(errors):
         errors, inside = np.full((1, 2), np.nan), float("nan")
     else:
-        inside = inside_ellipsoid(vectors, covariances)
+        inside = share_inside(normalised_errors(vectors, covariances))
     figures = {
         "accepted": sum(len(result.errors) for result in results),
         "wrong": sum(result.wrong for result in results),

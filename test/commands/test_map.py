@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +13,7 @@ import rasterio
 import yaml
 from command_line import Ended, only_line, umf
 from recordings import part_of, traverse, write_mcap
+from sources import rows_of
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
@@ -112,8 +112,7 @@ def test_a_rover_finds_itself_in_the_map_which_stays_as_it_is(
     there, both = known.at(found.stamps_ns)
     apart = np.linalg.norm(found.poses[both, :3, 3] - there[both, :3, 3], axis=1)
     assert both.sum() > 5 and apart.max() < 0.5
-    with (tmp_path / "latest" / "localization.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "latest" / "localization.csv")
     assert len(rows) == about["located"] and all(float(row["probability"]) > 0.99 for row in rows)
     assert all(0 < float(row["sigma_x_m"]) < 1 for row in rows)
     assert {path: path.read_bytes() for path in before} == before

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shlex
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import pytest
 from command_line import only_line, umf
 from maps_made import MadeSession, made_map, tie
+from sources import rows_of
 
 from umf_ros.core.errors import UmfError
 from umf_ros.map_poses import POSES, read_poses
@@ -32,11 +32,8 @@ def folder(tmp_path: Path) -> MapFolder:
 
 
 def decided(folder: MapFolder) -> dict[tuple[str, str], tuple[str, str]]:
-    with (folder.path / "graph_verdicts.csv").open(newline="") as file:
-        return {
-            (row["match_stamp_ns"], row["query_stamp_ns"]): (row["verdict"], row["reason"])
-            for row in csv.DictReader(file)
-        }
+    rows = rows_of(folder.path / "graph_verdicts.csv")
+    return {(row["match_stamp_ns"], row["query_stamp_ns"]): (row["verdict"], row["reason"]) for row in rows}
 
 
 def test_edits_are_kept_through_every_solution_and_undone_by_name(folder: MapFolder) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import signal
@@ -17,6 +16,7 @@ import pytest
 from command_line import only_line
 from command_line import umf as umf_here
 from recordings import LEFT, ODOMETRY, RIGHT, TRUTH, traverse, write_mcap
+from sources import rows_of
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
@@ -74,11 +74,6 @@ def truth_of(bag: Path) -> tuple[np.ndarray, np.ndarray]:
     truth = read_ground_truth(open_bag(bag))
     assert truth is not None
     return truth.stamps_ns, truth.poses
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_the_tables_tell_the_same_story(run: Path) -> None:

@@ -24,35 +24,25 @@ HOW = {"time.sleep(99)": 1, BUSY_LOCK: -signal.SIGALRM}
 """Exit status of a process that stands still like this."""
 
 
-@pytest.mark.parametrize("stand_still", HOW)
-def test_a_main_thread_that_stands_still_ends_the_process(stand_still: str) -> None:
-    done = ended(f"""
-        import time
-        from umf_ros.core import watchdog
-        def stands_still(): {stand_still}
-        watchdog.GRACE_S = 1
-        with watchdog.watching(1.0):
-            stands_still()
-    """)
-    assert done.returncode == HOW[stand_still]
-    assert "in stands_still" in done.stderr
+IN_MAIN = """
+with watchdog.watching(1.0):
+    stands_still(1)
+"""
+IN_WORKER = """
+with watchdog.watching(1.0):
+    worker = Worker(stands_still, print, 1)
+    worker.submit(1)
+    while True:
+        watchdog.feed()
+        time.sleep(0.05)
+"""
 
 
 @pytest.mark.parametrize("stand_still", HOW)
-def test_a_worker_that_stands_still_ends_the_process_while_the_main_thread_feeds(stand_still: str) -> None:
-    done = ended(f"""
-        import time
-        from umf_ros.core import watchdog
-        from umf_ros.nodes.process import Worker
-        def stands_still(item): {stand_still}
-        watchdog.GRACE_S = 1
-        with watchdog.watching(1.0):
-            worker = Worker(stands_still, print, 1)
-            worker.submit(1)
-            while True:
-                watchdog.feed()
-                time.sleep(0.05)
-    """)
+@pytest.mark.parametrize("program", [IN_MAIN, IN_WORKER], ids=["main thread", "worker while the main thread feeds"])
+def test_a_thread_that_stands_still_ends_the_process(program: str, stand_still: str) -> None:
+    head = "import time\nfrom umf_ros.core import watchdog\nfrom umf_ros.nodes.process import Worker\n"
+    done = ended(f"{head}def stands_still(item): {stand_still}\nwatchdog.GRACE_S = 1{program}")
     assert done.returncode == HOW[stand_still]
     assert "in stands_still" in done.stderr
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from sources import run
 from tiny_worlds import TINY, some_scan
 
 from umf_ros.core.config import EmbeddingSettings
@@ -203,7 +203,7 @@ for _ in range(2):
 signal.signal(signal.SIGINT, lambda *_: print("alive"))
 os.kill(os.getpid(), signal.SIGINT)
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    done = run(sys.executable, "-c", script, timeout=120)
     assert (done.returncode, done.stdout) == (0, "alive\n"), done.stderr
 
 
@@ -216,7 +216,7 @@ from umf_ros.embedding.runtimes import XFEAT_OUTPUTS, make_runtime
 make_runtime(find("models/xfeat.safetensors"), EmbeddingSettings(threads=1), XFEAT_OUTPUTS)
 print([name for name in ("openvino_telemetry", "torch", "nncf") if sys.modules.get(name)], "openvino" in sys.modules)
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    done = run(sys.executable, "-c", script, timeout=120)
     assert (done.returncode, done.stdout) == (0, "[] True\n"), done.stderr
 
 
@@ -261,7 +261,7 @@ with watching(20.0):
 def test_concurrent_inference_does_not_deadlock():
     """Without the warm-up one start in six hung."""
     for _ in range(8):
-        done = subprocess.run([sys.executable, "-c", BARE], capture_output=True, text=True, timeout=60)
+        done = run(sys.executable, "-c", BARE)
         assert done.returncode == 0, done.stderr
 
 
@@ -298,5 +298,5 @@ print(failed, locale.setlocale(locale.LC_ALL) == before)
 
 def test_threads_that_load_at_once_neither_fail_nor_change_the_locale():
     """Else a model is "damaged", or all text of the process is ASCII from then on."""
-    done = subprocess.run([sys.executable, "-c", LOADING], capture_output=True, text=True, timeout=120)
+    done = run(sys.executable, "-c", LOADING, timeout=120)
     assert (done.returncode, done.stdout) == (0, "[] True\n"), done.stdout + done.stderr

@@ -1,4 +1,3 @@
-import csv
 import json
 from contextlib import closing
 from dataclasses import replace
@@ -7,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from maps_made import MadeSession, made_map, on_circle, tie
+from sources import rows_of
 
 from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.config import Settings
@@ -96,8 +96,7 @@ def test_results_are_listed_by_session(tmp_path: Path) -> None:
     counts = {f"closures_{where}": {"found": 9, "accepted": 6, "pending": 3} for where in ("within", "between")}
     assert sentence({"sessions": [{}], **counts}) == "one session; its closures: 9 found, 6 accepted, 3 pending"
     assert [one["graph_sessions"] for one in summary["sessions"]] == [[0], [1]]
-    with (folder.path / "graph.csv").open() as file:
-        sessions = [row["session"] for row in csv.DictReader(file)]
+    sessions = [row["session"] for row in rows_of(folder.path / "graph.csv")]
     assert set(sessions) == {"0", "1"}
     vertices = (folder.path / "graph.g2o").read_text().count("VERTEX")
     assert vertices == len(sessions)

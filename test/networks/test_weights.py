@@ -71,59 +71,32 @@ def test_shipped_weights_are_known_by_name(tmp_path, monkeypatch):
     assert locate_weights(tmp_path / "umf_light") == tmp_path / "umf_light"
 
 
-def test_missing(tmp_path):
-    with pytest.raises(WeightsError, match="do not exist"):
-        load_weights(tmp_path / "none.safetensors")
-
-
-def test_truncated(weights):
-    weights.write_bytes(weights.read_bytes()[:5000])
-    with pytest.raises(WeightsError, match="truncated"):
-        load_weights(weights)
-
-
-def test_not_weights_at_all(weights):
-    weights.write_text("hello")
-    with pytest.raises(WeightsError, match="not a safetensors file"):
-        load_weights(weights)
-
-
-def test_not_a_number(weights):
-    tensors = load_file(weights)
+def with_nan(path):
+    tensors = load_file(path)
     tensors["fusion.image_head.weight"][0, 0] = float("nan")
-    rewrite(weights, tensors)
-    with pytest.raises(WeightsError, match=r"fusion\.image_head\.weight holds values that are not finite"):
-        load_weights(weights)
+    rewrite(path, tensors)
 
 
-def test_another_architecture_by_name(weights):
-    rewrite(weights, architecture=asdict(TINY) | {"vision": "transformer"})
-    with pytest.raises(WeightsError, match="another architecture"):
-        load_weights(weights)
+FAULTS = {
+    "missing": (Path.unlink, "do not exist"),
+    "truncated": (lambda path: path.write_bytes(path.read_bytes()[:5000]), "truncated"),
+    "text": (lambda path: path.write_text("hello"), "not a safetensors file"),
+    "not a number": (with_nan, r"fusion\.image_head\.weight holds values that are not finite"),
+    "another name": (lambda path: rewrite(path, architecture=asdict(TINY) | {"vision": 1}), "another architecture"),
+    "another shape": (lambda path: rewrite(path, architecture=asdict(TINY) | {"tokens": 48}), "another architecture"),
+    "other tensors": (lambda path: rewrite(path, {"layer.weight": torch.zeros(3)}), "another architecture"),
+    "no architecture": (lambda path: save_file(load_file(path), path), "states none"),
+    "no JSON": (lambda path: save_file(load_file(path), path, {"architecture": "{not json"}), "another architecture"),
+    "a list": (lambda path: save_file(load_file(path), path, {"architecture": "[1, 2]"}), "another architecture"),
+    "a number": (lambda path: save_file(load_file(path), path, {"architecture": "7"}), "another architecture"),
+}
 
 
-def test_another_architecture_by_shape(weights):
-    rewrite(weights, architecture=asdict(TINY) | {"tokens": 48})
-    with pytest.raises(WeightsError, match="another architecture"):
-        load_weights(weights)
-
-
-def test_someone_elses_tensors(weights):
-    rewrite(weights, {"layer.weight": torch.zeros(3)})
-    with pytest.raises(WeightsError, match="another architecture"):
-        load_weights(weights)
-
-
-def test_no_word_about_the_architecture(weights):
-    save_file(load_file(weights), weights)
-    with pytest.raises(WeightsError, match="states none"):
-        load_weights(weights)
-
-
-@pytest.mark.parametrize("word", ["{not json", "[1, 2]", "7"])
-def test_a_garbled_word_about_the_architecture(weights, word):
-    save_file(load_file(weights), weights, metadata={"architecture": word})
-    with pytest.raises(WeightsError, match="another architecture"):
+@pytest.mark.parametrize("fault", FAULTS)
+def test_other_files_are_refused(weights, fault):
+    change, message = FAULTS[fault]
+    change(weights)
+    with pytest.raises(WeightsError, match=message):
         load_weights(weights)
 
 

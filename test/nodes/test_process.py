@@ -21,16 +21,12 @@ def start(action: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False)
 
 
-@pytest.mark.parametrize("action", ["interrupt", "terminate"])
-def test_a_signal_ends_the_spinning_and_the_node_finishes_its_work(action: str) -> None:
+@pytest.mark.parametrize(
+    ("action", "state"), [("interrupt", "publishing"), ("terminate", "publishing"), ("shutdown", "cut off")]
+)
+def test_a_signal_or_a_lost_context_ends_the_spinning_and_the_node_finishes_its_work(action: str, state: str) -> None:
     ended = start(action)
-    assert ended.stdout.splitlines()[-2:] == ["closed while publishing", "context shut down"], ended.stderr
-    assert ended.returncode == 0
-
-
-def test_a_context_that_is_shut_down_ends_the_spinning_too() -> None:
-    ended = start("shutdown")
-    assert ended.stdout.splitlines()[-2:] == ["closed while cut off", "context shut down"], ended.stderr
+    assert ended.stdout.splitlines()[-2:] == [f"closed while {state}", "context shut down"], ended.stderr
     assert ended.returncode == 0
 
 
@@ -39,10 +35,14 @@ def test_a_node_without_work_to_finish_ends_too() -> None:
     assert (ended.returncode, ended.stdout) == (0, "context shut down\n"), ended.stderr
 
 
-def test_an_error_at_the_start_is_one_line_and_status_1() -> None:
-    ended = start("refuse")
-    assert (ended.returncode, ended.stdout) == (1, "context shut down\n")
-    assert ended.stderr == "umf: unknown parameter loop.topk\n"
+@pytest.mark.parametrize(
+    ("action", "line"),
+    [("refuse", "unknown parameter loop.topk"), ("overflow", "cannot write results: No space left on device")],
+)
+def test_an_error_of_a_user_or_a_full_disk_is_one_line_and_status_1(action: str, line: str) -> None:
+    ended = start(action)
+    assert (ended.returncode, ended.stdout.splitlines()[-1]) == (1, "context shut down")
+    assert ended.stderr == f"umf: {line}\n"
 
 
 def test_a_callback_that_fails_is_told_and_the_node_goes_on() -> None:
@@ -50,12 +50,6 @@ def test_a_callback_that_fails_is_told_and_the_node_goes_on() -> None:
     assert ended.stdout.count("ZeroDivisionError: a fault in the program; the node continues") == 3, ended.stdout
     assert ended.stdout.splitlines()[-2:] == ["closed while publishing", "context shut down"]
     assert ended.returncode == 0 and "Traceback" not in ended.stderr
-
-
-def test_results_that_cannot_be_written_are_one_line_and_status_1() -> None:
-    ended = start("overflow")
-    assert ended.returncode == 1 and ended.stdout.splitlines()[-1] == "context shut down"
-    assert ended.stderr == "umf: cannot write results: No space left on device\n"
 
 
 @pytest.mark.parametrize(

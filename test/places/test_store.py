@@ -71,13 +71,6 @@ def test_keyframes_are_found_by_stamp_also_where_stamps_repeat() -> None:
     assert opened.rows_at(2 * 10**9) == [2, 6] and opened.rows_at(77) == []
 
 
-def test_a_descriptor_of_another_length_is_damage(tmp_path: Path) -> None:
-    path = filled(tmp_path / "map.sqlite")
-    change(path, "UPDATE keyframe SET descriptor = ? WHERE id = 3", b"1234")
-    with pytest.raises(UmfError, match=r"map\.sqlite is damaged"):
-        database(path)
-
-
 def test_opening_does_not_read_the_keyframes_themselves(tmp_path: Path) -> None:
     path = filled(tmp_path / "map.sqlite")
     change(path, "UPDATE keyframe SET data = ?", b"no keyframe")
@@ -271,12 +264,11 @@ def test_a_damaged_keyframe_is_named_and_the_others_are_read(tmp_path: Path, dat
     assert places[3].stamp_ns == 3 * 10**9
 
 
-@pytest.mark.parametrize("start", [4096, 20_000])
-def test_a_damaged_file_is_one_clear_line(tmp_path: Path, start: int) -> None:
+@pytest.mark.parametrize(("start", "zeros"), [(4096, True), (20_000, True), (9000, False)])
+def test_a_damaged_file_is_one_clear_line(tmp_path: Path, start: int, zeros: bool) -> None:
     path = filled(tmp_path / "map.sqlite", 40)
-    content = bytearray(path.read_bytes())
-    content[start:] = bytes(len(content) - start)
-    path.write_bytes(content)
+    content = path.read_bytes()
+    path.write_bytes(content[:start] + bytes(len(content) - start if zeros else 0))
     with pytest.raises(UmfError, match=r"map\.sqlite (is damaged|cannot be used)") as caught:
         places = database(path)
         for i in range(len(places)):
@@ -284,18 +276,19 @@ def test_a_damaged_file_is_one_clear_line(tmp_path: Path, start: int) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_whose_end_is_missing_is_one_clear_line(tmp_path: Path) -> None:
-    path = filled(tmp_path / "map.sqlite", 40)
-    path.write_bytes(path.read_bytes()[:9000])
-    with pytest.raises(UmfError, match=r"map\.sqlite (is damaged|cannot be used)"):
-        database(path)
-
-
-@pytest.mark.parametrize(("column", "value"), [("session", 2**63 - 1), ("id", 2**63 - 1), ("id", -5)])
-def test_ids_and_sessions_out_of_range_are_refused(tmp_path: Path, column: str, value: int) -> None:
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("session", 2**63 - 1, "session is out of range"),
+        ("id", 2**63 - 1, "id is out of range"),
+        ("id", -5, "id is out of range"),
+        ("descriptor", b"1234", r"map\.sqlite is damaged"),
+    ],
+)
+def test_values_that_cannot_be_are_refused(tmp_path: Path, column: str, value: object, message: str) -> None:
     path = filled(tmp_path / "map.sqlite")
     change(path, f"UPDATE keyframe SET {column} = ? WHERE id = 4", value)
-    with pytest.raises(UmfError, match=f"{column} is out of range"):
+    with pytest.raises(UmfError, match=message):
         database(path)
 
 

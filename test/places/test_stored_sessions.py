@@ -79,65 +79,51 @@ def test_a_damaged_identity_is_refused_in_one_line(path: Path, lie: str) -> None
 
 
 ENDLESS = "WITH RECURSIVE r(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM r) SELECT"
-TRAPS = {
-    "view": ["DROP TABLE keyframe", f"CREATE VIEW keyframe AS {ENDLESS} i id, i stamp_ns, 0 session FROM r"],
-    "trigger": [f"CREATE TRIGGER t AFTER INSERT ON keyframe BEGIN INSERT INTO about {ENDLESS} i FROM r; END"],
-    "computed": ["ALTER TABLE keyframe ADD COLUMN large AS (zeroblob(900000000))"],
+FOREIGN = r"its (table|index) \w+ is not that of a place database"
+NO_NUMBER = "the stamp, session or path length of keyframe 2 is not a number"
+DAMAGES = {
+    "view": (
+        ["DROP TABLE keyframe", f"CREATE VIEW keyframe AS {ENDLESS} i id, i stamp_ns, 0 session FROM r"],
+        "it holds a view",
+    ),
+    "trigger": (
+        [f"CREATE TRIGGER t AFTER INSERT ON keyframe BEGIN INSERT INTO about {ENDLESS} i FROM r; END"],
+        "it holds a trigger",
+    ),
+    "computed": (["ALTER TABLE keyframe ADD COLUMN large AS (zeroblob(900000000))"], "it holds a table with computed"),
+    "constraint": (
+        [
+            "ALTER TABLE keyframe RENAME TO old",
+            "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, stamp_ns INTEGER NOT NULL CHECK (length(zeroblob(9e8)) "
+            "> 1), session INTEGER NOT NULL, travelled_m REAL, descriptor BLOB NOT NULL, data BLOB NOT NULL)",
+            "INSERT INTO keyframe SELECT * FROM old",
+            "DROP TABLE old",
+        ],
+        FOREIGN,
+    ),
+    "index on an expression": (["CREATE INDEX i ON keyframe (abs(stamp_ns))"], FOREIGN),
+    "partial index": (["CREATE UNIQUE INDEX i ON keyframe (session) WHERE session >= 0 AND id < 2"], FOREIGN),
+    "another column": (["ALTER TABLE keyframe ADD COLUMN more TEXT DEFAULT 'x'"], FOREIGN),
+    "constraint of another table": (
+        ["DROP TABLE submap", "CREATE TABLE submap (id INTEGER PRIMARY KEY, keypoints BLOB CHECK (0))"],
+        FOREIGN,
+    ),
+    **{
+        value: ([f"UPDATE keyframe SET {value} WHERE id = 2"], NO_NUMBER)
+        for value in ("stamp_ns = 'yesterday'", "session = x'00'", "travelled_m = 'far'", "stamp_ns = 1.5")
+    },
 }
 
 
-@pytest.mark.parametrize("trap", TRAPS)
-def test_views_triggers_and_computed_columns_are_refused(path: Path, trap: str) -> None:
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_files_that_compute_or_differ_are_refused(path: Path, damage: str) -> None:
+    statements, message = DAMAGES[damage]
     with sqlite3.connect(path) as connection:
-        for statement in TRAPS[trap]:
+        for statement in statements:
             connection.execute(statement)
-    delete = partial(delete_sessions, numbers=[0])
-    for use in (
-        stored_sessions,
-        stored_identity,
-        delete,
-        database,
-    ):
-        with pytest.raises(UmfError, match=f"it holds a.*{trap}"):
-            use(path)
-
-
-FOREIGN = {
-    "constraint": [
-        "ALTER TABLE keyframe RENAME TO old",
-        "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, stamp_ns INTEGER NOT NULL CHECK (length(zeroblob(9e8)) > 1), "
-        "session INTEGER NOT NULL, travelled_m REAL, descriptor BLOB NOT NULL, data BLOB NOT NULL)",
-        "INSERT INTO keyframe SELECT * FROM old",
-        "DROP TABLE old",
-    ],
-    "index on an expression": ["CREATE INDEX i ON keyframe (abs(stamp_ns))"],
-    "partial index": ["CREATE UNIQUE INDEX i ON keyframe (session) WHERE session >= 0 AND id < 2"],
-    "another column": ["ALTER TABLE keyframe ADD COLUMN more TEXT DEFAULT 'x'"],
-    "constraint of another table": [
-        "DROP TABLE submap",
-        "CREATE TABLE submap (id INTEGER PRIMARY KEY, keypoints BLOB CHECK (0))",
-    ],
-}
-
-
-@pytest.mark.parametrize("change", FOREIGN)
-def test_tables_that_are_not_ours_to_the_letter_are_refused(path: Path, change: str) -> None:
-    with sqlite3.connect(path) as connection:
-        for statement in FOREIGN[change]:
-            connection.execute(statement)
-    for use in (stored_sessions, stored_identity, partial(delete_sessions, numbers=[0]), database):
-        with pytest.raises(UmfError, match=r"its (table|index) \w+ is not that of a place database"):
-            use(path)
-
-
-@pytest.mark.parametrize(
-    "value", ["stamp_ns = 'yesterday'", "session = x'00'", "travelled_m = 'far'", "stamp_ns = 1.5"]
-)
-def test_a_key_that_is_no_number_is_named_in_one_line(path: Path, value: str) -> None:
-    with sqlite3.connect(path) as connection:
-        connection.execute(f"UPDATE keyframe SET {value} WHERE id = 2")
-    for use in (stored_sessions, partial(delete_sessions, numbers=[0]), database):
-        with pytest.raises(UmfError, match="the stamp, session or path length of keyframe 2 is not a number"):
+    reads = [] if message == NO_NUMBER else [stored_identity]
+    for use in (stored_sessions, partial(delete_sessions, numbers=[0]), database, *reads):
+        with pytest.raises(UmfError, match=message):
             use(path)
 
 

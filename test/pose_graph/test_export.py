@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from graph_worlds import (
     rms,
     two_laps,
 )
+from sources import rows_of
 
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.errors import OutputError
@@ -53,8 +53,7 @@ def test_results_hold_both_trajectories_for_evaluation(finished: PoseGraph, tmp_
 
 def test_the_verdict_table_says_why(finished: PoseGraph, tmp_path: Path) -> None:
     finished.write_results(tmp_path)
-    with (tmp_path / "graph_verdicts.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "graph_verdicts.csv")
     assert tuple(rows[0]) == VERDICT_COLUMNS
     assert len(rows) == len(WORLD.closures)
     (bad,) = [row for row in rows if row["verdict"] == "rejected"]
@@ -110,9 +109,7 @@ def test_vertices_keep_the_ids_of_their_file(tmp_path: Path) -> None:
     ]
     assert not (tmp_path / "out.csv").exists()
     write_verdicts_by_vertex(tmp_path / "verdicts.csv", graph, recording)
-    with (tmp_path / "verdicts.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert [(row["match"], row["query"]) for row in rows] == [("100", "150")]
+    assert [(row["match"], row["query"]) for row in rows_of(tmp_path / "verdicts.csv")] == [("100", "150")]
 
 
 def test_a_clock_that_went_back_is_written_in_order(tmp_path: Path) -> None:

@@ -46,6 +46,12 @@ def take(estimator: NoiseScaleEstimator, found: Loops, first_place: int = 0) -> 
         estimator.add(found[start : start + 10], found[start : start + 10], first_place + start)
 
 
+def scale_of(found: Loops) -> NoiseScale:
+    estimator = NoiseScaleEstimator()
+    take(estimator, found)
+    return estimator.scale
+
+
 def wrong(count: int, metres: float) -> Loops:
     right = loops(count, 1.0, 1.0, seed=9)
     rng = np.random.default_rng(10)
@@ -108,24 +114,17 @@ def test_the_longer_the_way_between_the_less_a_loop_says() -> None:
 
 @pytest.mark.parametrize(("odometry", "closures"), [(3.0, 1.0), (5.0, 1.0), (1.0, 4.0), (0.4, 1.0), (3.0, 3.0)])
 def test_factors_are_found(odometry: float, closures: float) -> None:
-    estimator = NoiseScaleEstimator()
-    take(estimator, loops(300, odometry, closures))
-    assert estimator.scale.odometry == pytest.approx(odometry, rel=0.3)
-    assert estimator.scale.closures == pytest.approx(closures, rel=0.3)
+    scale = scale_of(loops(300, odometry, closures))
+    assert (scale.odometry, scale.closures) == pytest.approx((odometry, closures), rel=0.3)
 
 
 def test_well_stated_noise_is_left_exactly_alone() -> None:
-    for seed in range(5):
-        estimator = NoiseScaleEstimator()
-        take(estimator, loops(200, 1.0, 1.0, seed))
-        assert estimator.scale == NoiseScale()
+    assert all(scale_of(loops(200, 1.0, 1.0, seed)) == NoiseScale() for seed in range(5))
 
 
 @pytest.mark.parametrize("factor", [1.3, 0.75])
 def test_a_slight_misstatement_is_not_worth_a_change(factor: float) -> None:
-    estimator = NoiseScaleEstimator()
-    take(estimator, loops(300, factor, 1.0))
-    assert estimator.scale.odometry == 1.0
+    assert scale_of(loops(300, factor, 1.0)).odometry == 1.0
 
 
 @pytest.mark.parametrize("metres", [4.0, 40.0])
@@ -156,17 +155,14 @@ def test_few_loops_change_nothing() -> None:
 
 def test_one_place_does_not_make_all_closures_worse() -> None:
     """Two wrong groups that overlap miss each other by little there: it looks like the noise of closures."""
-    one, many, found = NoiseScaleEstimator(), NoiseScaleEstimator(), loops(200, 1.0, 4.0)
+    one, found = NoiseScaleEstimator(), loops(200, 1.0, 4.0)
     one.add(found, found, 7)
-    take(many, found)
     assert one.scale.closures == 1.0
-    assert many.scale.closures == pytest.approx(4.0, rel=0.3)
+    assert scale_of(found).closures == pytest.approx(4.0, rel=0.3)
 
 
 def test_odometry_is_not_believed_to_be_much_better_than_it_says() -> None:
-    estimator = NoiseScaleEstimator()
-    take(estimator, loops(300, 0.05, 1.0))
-    assert estimator.scale == NoiseScale(odometry=0.3)
+    assert scale_of(loops(300, 0.05, 1.0)) == NoiseScale(odometry=0.3)
 
 
 def test_the_axis_that_drifts_decides() -> None:
@@ -181,9 +177,7 @@ def test_the_axis_that_drifts_decides() -> None:
 
 
 def test_other_units_keep_the_ratio_of_odometry_and_closures() -> None:
-    estimator = NoiseScaleEstimator()
-    take(estimator, loops(300, 0.02, 0.02))
-    scale = estimator.scale
+    scale = scale_of(loops(300, 0.02, 0.02))
     assert scale.odometry == pytest.approx(0.02, rel=0.3)
     assert scale.closures == scale.odometry
 

@@ -6,13 +6,14 @@ import pytest
 
 from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError
-from umf_ros.runs.writer import PLACES, create_folder, finish_folder, unfinished_folder, with_places
+from umf_ros.core.io import create_run_folder
+from umf_ros.runs.writer import PLACES, begin_folder, finish_folder, unfinished_folder, with_places
 
 BAG = Path("some.mcap")
 
 
 def begun(out: Path, settings: Settings) -> Path:
-    folder = create_folder(out, BAG)
+    folder = begin_folder(create_run_folder(out), BAG)
     (folder / "config.yaml").write_text(dump_settings(settings))
     return folder
 
@@ -33,7 +34,7 @@ def test_another_recording_or_other_settings_are_not_resumed(tmp_path: Path) -> 
 
 
 def test_a_run_interrupted_before_its_first_row_is_resumed(tmp_path: Path) -> None:
-    cut = create_folder(tmp_path, BAG)
+    cut = begin_folder(create_run_folder(tmp_path), BAG)
     assert unfinished_folder(tmp_path, BAG, Settings()) == cut
 
 

@@ -9,17 +9,8 @@ import numpy as np
 
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array
-from umf_ros.lab.fit.acceptance import (
-    inside_ellipsoid,
-)
-from umf_ros.lab.simulation.domains.pairs import (
-    ELSEWHERE,
-    SAME,
-    TURNED,
-    ScanPair,
-    error_vector,
-    is_wrong,
-)
+from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, SAME, TURNED, ScanPair, is_wrong
+from umf_ros.runs.truth import normalised_errors, pose_error, share_inside
 
 
 @dataclass
@@ -47,7 +38,7 @@ class Outcome:
             self.wrong[pair.kind] += 1
             return
         self.right[pair.kind] += 1
-        self.errors.append(error_vector(closure.match_T_query, pair.match_T_query))
+        self.errors.append(pose_error(closure.match_T_query, pair.match_T_query))
         self.covariances.append(closure.covariance)
 
     def share(self, kind: str) -> float:
@@ -57,7 +48,8 @@ class Outcome:
     @property
     def figures(self) -> dict[str, Any]:
         """The domain's own figures."""
-        inside = inside_ellipsoid(np.array(self.errors), np.array(self.covariances)) if self.errors else float("nan")
+        errors, covariances = np.array(self.errors), np.array(self.covariances)
+        inside = share_inside(normalised_errors(errors, covariances)) if self.errors else float("nan")
         return {
             "pairs": sum(self.pairs.values()),
             "accepted": sum(self.right.values()) + sum(self.wrong.values()),

@@ -21,8 +21,8 @@ from umf_ros.core.geometry import (
     propagate,
     ros_to_gtsam_covariance,
 )
-from umf_ros.lab.fit.acceptance import inside_ellipsoid
-from umf_ros.lab.simulation.domains.pairs import error_vector, is_wrong
+from umf_ros.lab.simulation.domains.pairs import is_wrong
+from umf_ros.runs.truth import normalised_errors, pose_error, share_inside
 from umf_ros.sensors.decode import Cloud
 from umf_ros.verification import Hypothesis
 
@@ -89,7 +89,7 @@ def summary(verdicts: list[tuple[RealPair, Hypothesis]]) -> dict[str, float]:
     errors, covariances = [], []
     for pair, verdict in right:
         if pair.match_T_query is not None and verdict.closure is not None:
-            errors.append(error_vector(verdict.closure.match_T_query, pair.match_T_query))
+            errors.append(pose_error(verdict.closure.match_T_query, pair.match_T_query))
             covariances.append(verdict.closure.covariance)
     nan = float("nan")
     return {
@@ -99,7 +99,7 @@ def summary(verdicts: list[tuple[RealPair, Hypothesis]]) -> dict[str, float]:
         "false_pairs": len(verdicts) - len(true),
         "false_accepted": sum(not pair.same_place for pair, _ in accepted),
         "error_median_m": float(np.median(np.linalg.norm(np.array(errors)[:, :3], axis=1))) if errors else nan,
-        "inside_95": inside_ellipsoid(np.array(errors), np.array(covariances)) if errors else nan,
+        "inside_95": share_inside(normalised_errors(np.array(errors), np.array(covariances))) if errors else nan,
     } | among_themselves(right)
 
 

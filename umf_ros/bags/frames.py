@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from umf_ros.absolute.measurement import ABSOLUTE_TYPES, AbsoluteDecoder, AbsoluteMeasurement, Aid
+from umf_ros.bags.inputs import present_topics
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.bags.reader import Bag, RawMessage, decode, stamp_span
 from umf_ros.bags.trajectories import decode_ground_truth
@@ -52,7 +53,7 @@ class FrameReader:
             CalibrationError: the calibration cannot be read.
             ConfigError: the embedding method reads only images, or only scans, and there are none.
         """
-        topics = _present(topics_of(settings), bag)
+        topics = _checked_topics(bag, settings)
         check_inputs(settings.embedding.method, bag.path, bool(topics.left_image), bool(topics.cloud))
         if odometry is not None:
             _check_overlap(odometry, bag, {topics.cloud, topics.left_image})
@@ -151,21 +152,18 @@ def _absolute_topics(settings: Settings, bag: Bag) -> dict[str, Aid]:
     return found
 
 
-def _present(topics: Topics, bag: Bag) -> Topics:
+def _checked_topics(bag: Bag, settings: Settings) -> Topics:
     """Return the topics with messages in the recording; the others empty.
 
     Raises:
         BagError: a topic is of another type than expected, or there are neither images nor scans.
     """
-    missing = []
-    for name, topic in topics.model_dump().items():
+    for name, topic in topics_of(settings).model_dump().items():
         info = bag.topics.get(topic)
         if info is not None and info.type not in TYPES[name]:
             text = f"{bag.path}: {topic} is of type {info.type}, expected {either(TYPES[name])}"
             raise BagError(text + (IMU_HINT if info.type == "sensor_msgs/msg/Imu" else ""))
-        if info is None or not info.count:
-            missing.append(name)
-    present = topics.model_copy(update=dict.fromkeys(missing, ""))
+    present = present_topics(bag, settings)
     if not present.left_image and not present.cloud:
         raise BagError(f"{bag.path} has neither images nor scans on the expected topics; see --dataset and --config")
     return present

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.inputs import present_topics
 from umf_ros.bags.reader import Bag
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core.config import EmbeddingSettings, Settings, topics_of
@@ -24,9 +25,8 @@ FIRST = 5
 
 def can_track(bag: Bag, settings: Settings) -> bool:
     """Return whether a recording has scans on the expected topic, and no odometry."""
-    topics = topics_of(settings)
-    counts = {name: bag.topics[name].count if name in bag.topics else 0 for name in (topics.cloud, topics.odometry)}
-    return bool(counts[topics.cloud]) and not counts[topics.odometry]
+    present = present_topics(bag, settings)
+    return bool(present.cloud) and not present.odometry
 
 
 def odometry_of_scans(

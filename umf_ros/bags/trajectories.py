@@ -164,12 +164,6 @@ def decode_ground_truth(bag: Bag, messages: Iterable[RawMessage]) -> Trajectory 
         raise BagError(f"{bag.path}: ground truth holds a {error}") from None
 
 
-def _checked(nanoseconds: int) -> int:
-    if abs(nanoseconds) >= LAST_STAMP_NS:
-        raise OverflowError("beyond the last stamp")
-    return nanoseconds
-
-
 def read_rtklib(path: str | Path, worst_quality: int = WORST_QUALITY) -> Trajectory:
     """Return positions east, north and up of the first one, in metres, without orientation, and their stamps in UTC.
 
@@ -206,5 +200,7 @@ def _parse(fields: list[str]) -> tuple[int, float, float, float, int]:
     if "/" in fields[0]:
         gps_ns = int(np.datetime64(f"{fields[0].replace('/', '-')}T{fields[1]}", "ns").astype(np.int64))
     else:
-        gps_ns = _checked((GPS_EPOCH_S + int(fields[0]) * 604_800) * 10**9 + round(float(fields[1]) * 1e9))
+        gps_ns = (GPS_EPOCH_S + int(fields[0]) * 604_800) * 10**9 + round(float(fields[1]) * 1e9)
+    if abs(gps_ns) >= LAST_STAMP_NS:
+        raise OverflowError("beyond the last stamp")
     return gps_ns - LEAP_SECONDS * 10**9, latitude, longitude, height, int(fields[5])

@@ -81,13 +81,14 @@ def command(
         from umf_ros.bags.frames import FrameReader
         from umf_ros.bags.inputs import absent_inputs, input_counts
         from umf_ros.bags.trajectories import read_ground_truth
+        from umf_ros.core.io import create_run_folder
         from umf_ros.core.resources import MADE_ODOMETRY
         from umf_ros.core.watchdog import watching
         from umf_ros.replay import Replay
         from umf_ros.runs.reader import read_run, remember_recording
         from umf_ros.runs.rerun_log import RerunLog
         from umf_ros.runs.run_file import read_odometry_of
-        from umf_ros.runs.writer import count_drops, create_folder, finish_folder, unfinished_folder, with_places
+        from umf_ros.runs.writer import begin_folder, count_drops, finish_folder, unfinished_folder, with_places
 
     _tell_inputs(console, settings)
     warnings: list[str] = []
@@ -104,7 +105,7 @@ def command(
         # a store or a map that cannot be used is reported before there is a folder
         known = settings.database.path or (settings.localizing and not settings.grows_map)
         detector = LoopDetector(settings, network) if known else None
-        folder = unfinished or create_folder(out, bag)
+        folder = unfinished or begin_folder(create_run_folder(out), bag)
         known_odometry = chosen.keep(folder, path)
         detector = detector or LoopDetector(with_places(settings, folder), network)
     del network, starting  # only the detector keeps the network, until it is closed: the report needs the memory

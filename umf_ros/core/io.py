@@ -354,13 +354,10 @@ class SqliteFile:
             ValueError: it holds something else.
         """
         self.connection.execute("PRAGMA trusted_schema = OFF")
-        for kind, name in self.connection.execute("SELECT type, name FROM sqlite_master"):
+        for kind, hidden in self.connection.execute(_COLUMNS):
             if kind not in ("table", "index"):
                 raise ValueError(f"it holds a {kind}")
-            columns: Any = ()
-            if kind == "table":
-                columns = self.connection.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,))
-            if any(hidden for (hidden,) in columns):
+            if hidden:
                 raise ValueError("it holds a table with computed columns")
 
     def _check_tables(self, schema: Schema, version: int) -> None:
@@ -383,6 +380,8 @@ class SqliteFile:
                 raise ValueError(f"its {key[0]} {shortened(key[1])} is not that of a {schema.name}")
 
 
+_COLUMNS = "SELECT one.type, hidden FROM sqlite_master AS one LEFT JOIN pragma_table_xinfo(one.name)"
+"""Kinds of all objects of a file, and whether each of their columns is computed."""
 _OBJECTS = "SELECT type, name, tbl_name, sql FROM sqlite_master WHERE sql IS NOT NULL"
 
 

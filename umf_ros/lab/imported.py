@@ -11,13 +11,12 @@ import numpy as np
 import yaml
 
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
-from umf_ros.bags.reader import message_types
 from umf_ros.core.config import Topics
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
 from umf_ros.core.io import check_absent, write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.lab.scan_files import SensorFileError, read_image
-from umf_ros.lab.simulation.bag_writer import BagWriter, image_message, pose_message
+from umf_ros.lab.simulation.bag_writer import BagWriter, image_message, packed_cloud, pose_message
 from umf_ros.sensors.decode import Cloud
 
 OPTICAL = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
@@ -70,7 +69,6 @@ def pose_entry(pose: Array) -> dict[str, list[float]]:
 
 
 _LAYOUT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
-_FLOAT32 = 7
 
 TOPICS = Topics(
     left_image="/camera/left/image",
@@ -117,27 +115,11 @@ def _entries(found: Imported) -> Iterator[Entry]:
             yield stamp, GROUND_TRUTH_TOPIC, lambda stamp=stamp, pose=pose: pose_message(pose, stamp, "map")  # type: ignore[misc]
 
 
-def cloud_message(cloud: Cloud, stamp_ns: int, frame: str = "lidar") -> Any:
+def cloud_message(cloud: Cloud, stamp_ns: int) -> Any:
     """sensor_msgs/PointCloud2 of x, y, z and, where there is one, the intensity."""
     layout = _LAYOUT if cloud.intensity is not None else np.dtype(_LAYOUT.descr[:3])
     records = np.zeros(len(cloud.points), layout)
     records["x"], records["y"], records["z"] = cloud.points.T
     if cloud.intensity is not None:
         records["intensity"] = cloud.intensity
-    types = message_types().types
-    field = types["sensor_msgs/msg/PointField"]
-    stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    return types["sensor_msgs/msg/PointCloud2"](
-        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame),
-        height=1,
-        width=len(records),
-        fields=[
-            field(name=name, offset=4 * place, datatype=_FLOAT32, count=1)
-            for place, name in enumerate(layout.names or ())
-        ],
-        is_bigendian=False,
-        point_step=layout.itemsize,
-        row_step=layout.itemsize * len(records),
-        data=records.view(np.uint8).reshape(-1),
-        is_dense=True,
-    )
+    return packed_cloud(records, stamp_ns, is_dense=True)

@@ -162,11 +162,6 @@ class CloudViews:
     headings_deg: tuple[float, ...]
     lidar: VirtualLidar
 
-    def order(self, turn_deg: float) -> list[int]:
-        """Return the rows of the poses in the order in which a heading is driven."""
-        rows = list(range(len(self.poses)))
-        return rows[::-1] if turn_deg == 180 else rows
-
 
 def import_cloud(
     target: MapFolder, path: Path, views: CloudViews, embedder: Embedder, on_place: Callable[[], None] = lambda: None
@@ -178,7 +173,8 @@ def import_cloud(
     """
     first, count = dict[int, tuple[int, Array]](), 0
     for turn_deg in views.headings_deg:
-        rows, turn = views.order(turn_deg), Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
+        rows = list(range(len(views.poses)))[:: -1 if turn_deg == 180 else 1]
+        turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
         walked, stamps = _walk(views.poses[rows] @ make_pose(turn, np.zeros(3)))
         places, between = dict[int, Keyframe](), list[LoopClosure]()
         for row, place in _places(views, embedder, walked, dict(zip(stamps, rows, strict=True))):

@@ -24,12 +24,12 @@ from shutil import rmtree
 from typing import Any, NamedTuple
 
 from umf_ros.bags.frames import FrameReader
-from umf_ros.bags.inputs import input_counts
+from umf_ros.bags.inputs import input_counts, present_topics
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
 from umf_ros.bags.trajectories import read_odometry
-from umf_ros.core.config import Database, ParameterSource, Settings, topics_of
+from umf_ros.core.config import Database, ParameterSource, Settings
 from umf_ros.core.errors import BagError, UmfError, writing
 from umf_ros.core.frames import Keyframe, LoopClosure
 from umf_ros.core.io import lock_file, write_table
@@ -146,8 +146,7 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
 def _odometry(bag: Bag, opening: Opening, settings: Settings, folder: Path) -> Trajectory | None:
     """Return the odometry of a file, or of the scans where the recording has none, which is kept in the run folder."""
     given, made = opening.odometry_of(bag.path, settings), folder / MADE_ODOMETRY
-    topic = bag.topics.get(topics_of(settings).odometry)
-    if given is not None or (topic is not None and topic.count):
+    if given is not None or present_topics(bag, settings).odometry:
         return given
     if not can_track(bag, settings):
         raise BagError(f"{bag.path} has neither odometry nor scans to make it from, {REMEDY}")

@@ -161,7 +161,8 @@ def judge(
     support = np.zeros(len(kept))
     beliefs = expit(prior)
     if known:
-        hear = _listeners(np.concatenate(known), settings)
+        everything = np.concatenate(known)
+        hear = [_listener(everything, row, settings) for row in range(len(everything))]
         for _ in range(_ROUNDS):
             support = np.array([one(beliefs) for one in hear])
             beliefs += _DAMPING * (expit(prior + support) - beliefs)
@@ -177,12 +178,8 @@ def _by_overlap(overlaps: Array) -> Array:
     return np.nan_to_num(odds + _BY_CONTRAST * (overlaps[:, 0] - overlaps[:, 1]), nan=_USUAL)
 
 
-def _listeners(closures: Closures, settings: PoseGraphSettings) -> list[Callable[[Array], float]]:
-    """Return for each closure the nats of support by the others, as a function of beliefs (N,) in these."""
-    return [_listener(closures, row, settings) for row in range(len(closures))]
-
-
 def _listener(closures: Closures, row: int, settings: PoseGraphSettings) -> Callable[[Array], float]:
+    """Return the nats of support of a closure by the others, as a function of beliefs (N,) in these."""
     paths_m = paths_between(closures, closures[row : row + 1])
     others = np.flatnonzero(paths_m.max(axis=0) <= settings.support_range_m)
     others = others[others != row]

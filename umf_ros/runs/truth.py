@@ -26,7 +26,6 @@ from umf_ros.sensors.motion_check import BETTER, CONTRAST
 from umf_ros.sensors.sensor_check import SensorReport
 from umf_ros.verification.hypothesis import Hypothesis
 
-CONFIDENCE = 0.95
 MEDIAN_EXPECTED = float(chdtri(6, 0.5))
 """Median of consistent normalised errors squared, 5.35: chi square with six degrees of freedom."""
 CONSISTENT_MEDIAN = (3.0, 8.0)
@@ -49,9 +48,9 @@ def normalised_errors(errors: Array, covariances: Array) -> Array:
     return found
 
 
-def share_inside(squared: Array, confidence: float = CONFIDENCE) -> float:
-    """Return the share of normalised errors squared inside the confidence ellipsoid; NaN without any."""
-    return float(np.mean(np.asarray(squared) < chdtri(6, 1 - confidence))) if len(squared) else nan
+def share_inside(squared: Array) -> float:
+    """Return the share of normalised errors squared inside the 95 % ellipsoid; NaN without any."""
+    return float(np.mean(np.asarray(squared) < chdtri(6, 0.05))) if len(squared) else nan
 
 
 def in_words(nees_median: float, inside_95: float) -> str:

@@ -22,7 +22,7 @@ from umf_ros.core.config import Settings, dump_settings, load_settings
 from umf_ros.core.errors import UmfError, writing
 from umf_ros.core.frames import Frame, Keyframe
 from umf_ros.core.geometry import Array, evenly, quantize
-from umf_ros.core.io import create_run_folder, memory_mb, write_atomically
+from umf_ros.core.io import memory_mb, write_atomically
 from umf_ros.core.limits import read_json
 from umf_ros.runs.run_file import (
     NAME,
@@ -48,18 +48,12 @@ PLACES = "places.sqlite"
 PHOTO_WIDTH, PHOTO_QUALITY, SCAN_POINTS = 320, 60, 3000  # by hand: rocks stay recognisable, at some 30 kB per keyframe
 
 
-def create_folder(out: Path, bag: Path) -> Path:
-    """Make a new folder inside `out` for a replay of `bag`."""
-    folder = create_run_folder(out)
-    begin_folder(folder, bag)
-    return folder
-
-
-def begin_folder(folder: Path, bag: Path) -> None:
-    """Make `folder`, if it is missing, the one of an unfinished replay of `bag`."""
+def begin_folder(folder: Path, bag: Path) -> Path:
+    """Make `folder`, if it is missing, the one of an unfinished replay of `bag`, and return it."""
     with writing(f"to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
     _note(folder, bag=str(bag.resolve()), finished=False)
+    return folder
 
 
 def is_unfinished(folder: Path, bag: Path) -> bool:

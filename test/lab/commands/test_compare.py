@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from command_line import only_line, umf
 from recordings import CALIBRATION
-from sources import ROOT
+from sources import ROOT, rows_of
 
 from umf_ros.lab.evaluation.comparison import RESULT_COLUMNS, VIEW_COLUMNS, Comparer
 
@@ -27,11 +26,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         cv2.imwrite(f"{name}.png", rng.integers(0, 255, (48, 64), np.uint8))
     Path("calibration.yaml").write_text(CALIBRATION, encoding="utf-8")
     return tmp_path
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_two_moments_of_a_recording_at_one_place(mini_bag: Path, tmp_path: Path) -> None:

@@ -68,13 +68,10 @@ def test_calde_is_in_millimetres_and_the_right_camera_in_the_left(tmp_path: Path
     assert found.left_T_right[:3, 3] == pytest.approx([0.09066, 0.0001, -0.002])
 
 
-def test_camchain_comes_with_the_imu(tmp_path: Path) -> None:
+def test_camchain_is_in_metres(tmp_path: Path) -> None:
     found = read_camchain(write(tmp_path / "camchain.yaml", CAMCHAIN))
-    assert found.baseline_m == pytest.approx(0.0907, abs=1e-4) and found.imu_later_s == 0.009
+    assert found.baseline_m == pytest.approx(0.0907, abs=1e-4)
     assert found.left_T_right[0, 3] == pytest.approx(0.0907)
-    assert found.imu_T_left is not None and found.imu_T_left[:3, 3] == pytest.approx([0, 0.25, 0.01])
-    del CAMCHAIN["cam0"]["T_cam_imu"]
-    assert read_camchain(write(tmp_path / "camchain.yaml", CAMCHAIN)).imu_T_left is None
 
 
 def test_a_calibration_of_a_file_is_one_that_the_package_reads(tmp_path: Path) -> None:

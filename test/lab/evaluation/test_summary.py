@@ -44,7 +44,7 @@ KEYS = (
 COST = Cost("small", 2**20, 40.0, 10.0)
 
 
-def scores(recall1: float, chance: float = 0.0, queries: int = 10) -> Scores:
+def scores(recall1: float, queries: int = 10) -> Scores:
     return Scores(
         queries=queries,
         recall1=recall1,
@@ -53,7 +53,6 @@ def scores(recall1: float, chance: float = 0.0, queries: int = 10) -> Scores:
         recall1_within_5m=recall1 - 0.1,
         auc_pr=recall1 - 0.2,
         recall_at_precision1=recall1 - 0.3,
-        chance=chance,
         recalls=np.linspace(recall1, 1, 25),
         curve=CURVE,
     )
@@ -61,7 +60,7 @@ def scores(recall1: float, chance: float = 0.0, queries: int = 10) -> Scores:
 
 def world(name: str, recall1: float, yaw: list[YawBin], **others: Scores) -> WorldResult:
     """A world in which everything has the same recall, except where said."""
-    every = {key: scores(recall1, chance=recall1 / 10) for key in NAMES}
+    every = {key: scores(recall1) for key in NAMES}
     named = {key.replace("_", " "): value for key, value in others.items()}
     return WorldResult(
         name=name,

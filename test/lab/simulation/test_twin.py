@@ -145,7 +145,7 @@ def test_the_toolkits_files_fit_together(folder: Path) -> None:
 def test_calibrations_say_what_the_drive_was_made_with_and_contradict_the_launch_file(folder: Path) -> None:
     one = next(one for one in find_s3li(folder).sequences if one.name == LAKE)
     cal, chain = (read_stereo(path) for path in one.calibrations)
-    assert cal.path.name == "2023-07-06.cal" and chain.imu_later_s == 0.009
+    assert cal.path.name == "2023-07-06.cal"
     assert cal.left["fx"] == pytest.approx(chain.left["fx"]) and cal.left["fx"] != 1739.0
     assert chain.baseline_m == pytest.approx(0.09066, abs=1e-6)
     assert len(contradictions([cal, chain], ["cal", "chain"], 0.0892)) == 2

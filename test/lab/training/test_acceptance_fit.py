@@ -14,10 +14,10 @@ from umf_ros.lab.fit.acceptance import (
     fit_covariance,
     fit_decision,
     fit_logistic,
-    inside_ellipsoid,
     scale_covariance,
 )
 from umf_ros.lab.fit.scan_acceptance import fit
+from umf_ros.runs.truth import normalised_errors, share_inside
 from umf_ros.verification.acceptance import load_acceptance, scores
 from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP
 from umf_ros.verification.scan_alignment import CovarianceModel, covariance_of
@@ -109,8 +109,8 @@ def test_covariance_is_recovered_and_honest() -> None:
     fitted = fit_covariance(np.array(errors), np.array(informations))
     assert 0.5 < fitted.inflation / true.inflation < 2.0
     covariances = covariance_of(np.array(informations), fitted)
-    assert 0.93 <= inside_ellipsoid(np.array(errors), covariances) <= 0.97
-    assert inside_ellipsoid(np.array(errors), covariances / 9) < 0.6
+    assert 0.93 <= share_inside(normalised_errors(np.array(errors), covariances)) <= 0.97
+    assert share_inside(normalised_errors(np.array(errors), covariances / 9)) < 0.6
 
 
 @pytest.mark.parametrize("factor", [0.2, 1.0, 9.0])
@@ -124,7 +124,7 @@ def test_covariances_of_the_wrong_size_are_scaled_until_95_percent_lie_inside(fa
     informations = np.array([np.diag(10 ** rng.uniform(3, 6, 6)) for _ in range(500)])
     errors = np.array([rng.multivariate_normal(np.zeros(6), covariance_of(found, true)) for found in informations])
     scaled = scale_covariance(stated, errors, covariance_of(informations, stated))
-    assert 0.93 <= inside_ellipsoid(errors, covariance_of(informations, scaled)) <= 0.97
+    assert 0.93 <= share_inside(normalised_errors(errors, covariance_of(informations, scaled))) <= 0.97
     assert scaled.inflation == pytest.approx(true.inflation, rel=0.2)
 
 

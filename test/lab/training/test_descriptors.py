@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import typer
+from sources import rows_of
 from tiny_worlds import write_world
 from typer.testing import CliRunner
 
@@ -41,11 +41,6 @@ def ignore(*_: object) -> None:
     pass
 
 
-def rows(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
-
-
 @pytest.mark.parametrize("method", NETWORKS)
 def test_a_run_learns_from_its_triplets_and_leaves_weights(
     method: str, folder: Path, small: Path, tmp_path: Path
@@ -60,7 +55,7 @@ def test_a_run_learns_from_its_triplets_and_leaves_weights(
     for name, value in network.named_parameters():
         if name in frozen:  # kept as published, but for half precision
             torch.testing.assert_close(value, fresh.get_parameter(name), rtol=1e-2, atol=1e-3)
-    log = rows(tmp_path / "run" / "log.csv")
+    log = rows_of(tmp_path / "run" / "log.csv")
     assert [row["step"] for row in log] == ["2", "4"] and 0 <= float(log[-1]["recall1"]) <= 1
     card = read_card(path)
     assert card["architecture"] == {"method": method} and "recall1" in card["untrained"]

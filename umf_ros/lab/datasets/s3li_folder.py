@@ -40,16 +40,12 @@ class StereoFile:
         path: of the file.
         left, right: entries of `raw_camera` in a calibration file.
         left_T_right: (4, 4).
-        imu_T_left: (4, 4); None where the file has no IMU.
-        imu_later_s: what is added to stamps of images to get those of the IMU; None likewise.
     """
 
     path: Path
     left: dict[str, Any]
     right: dict[str, Any]
     left_T_right: Array
-    imu_T_left: Array | None = None
-    imu_later_s: float | None = None
 
     def __post_init__(self) -> None:
         low, high = PLAUSIBLE_BASELINE_M
@@ -139,7 +135,7 @@ def _rigid(path: Path, turn: Array, shift: Array) -> Array:
 
 
 def read_camchain(path: Path) -> StereoFile:
-    """A Kalibr `camchain.yaml` of two pinhole cameras, with an IMU or without; metres.
+    """A Kalibr `camchain.yaml` of two pinhole cameras; metres.
 
     Raises:
         CalibrationError: the file is missing, cut, of other content, or in other units; one line.
@@ -152,11 +148,7 @@ def read_camchain(path: Path) -> StereoFile:
         raise CalibrationError(f"{path} is no camchain of Kalibr: cam0 and cam1 are not both there")
     left, right = (_camchain_camera(path, name, content[name]) for name in ("cam0", "cam1"))
     right_T_left = _pose(path, "cam1.T_cn_cnm1", content["cam1"].get("T_cn_cnm1"))
-    with_imu = content["cam0"].get("T_cam_imu")
-    imu_T_left = None if with_imu is None else invert(_pose(path, "cam0.T_cam_imu", with_imu))
-    later = content["cam0"].get("timeshift_cam_imu")
-    shift_s = float(later) if isinstance(later, int | float) else None
-    return StereoFile(path, left, right, invert(right_T_left), imu_T_left, shift_s)
+    return StereoFile(path, left, right, invert(right_T_left))
 
 
 def _camchain_camera(path: Path, name: str, values: dict[str, Any]) -> dict[str, Any]:

@@ -66,7 +66,6 @@ class Scores:
         recall1_within_5m: the best match lies within 5 m.
         auc_pr: area under the precision-recall curve.
         recall_at_precision1: found without a single false match.
-        chance: recall@1 of drawing a reference at random.
         recalls: (25,) a true match among the first 1, 2, ...
         curve: precision against recall.
     """
@@ -78,7 +77,6 @@ class Scores:
     recall1_within_5m: float
     auc_pr: float
     recall_at_precision1: float
-    chance: float
     recalls: Array
     curve: PrecisionRecall
 
@@ -116,7 +114,6 @@ def score(task: RetrievalTask, ranking: Ranking, unanswerable_count: bool = Fals
     curve = precision_recall(ranking.score[asked], correct[asked], answerable[asked])
     nothing = not answerable.any()
     near = ranking.hits(task.near)[answerable, :1].any(axis=1)
-    share = task.positive[answerable].sum(axis=1) / np.maximum(ranking.admissible[answerable], 1)
     return Scores(
         queries=int(answerable.sum()),
         recall1=float(recalls[0]),
@@ -125,7 +122,6 @@ def score(task: RetrievalTask, ranking: Ranking, unanswerable_count: bool = Fals
         recall1_within_5m=float("nan") if nothing else float(near.mean()),
         auc_pr=float("nan") if nothing else curve.area,
         recall_at_precision1=float("nan") if nothing else curve.recall_at_full_precision,
-        chance=float("nan") if nothing else float(share.mean()),
         recalls=recalls,
         curve=curve,
     )

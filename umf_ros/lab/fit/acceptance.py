@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from umf_ros.core.geometry import Array
-from umf_ros.runs.truth import normalised_errors, share_inside
+from umf_ros.runs.truth import normalised_errors
 from umf_ros.verification.acceptance import CRITERIA, AcceptanceModel, Logistic, Measurements, refuted, scores
 from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, kind_of
 from umf_ros.verification.measurement import MEASUREMENTS
@@ -186,11 +186,6 @@ def bounds_of(examples: list[Example], kind: str) -> dict[str, tuple[float, floa
         least, greatest = np.quantile(known, [1.0 - share, share])
         bounds[name] = 0.0 if name in DEVIATIONS else float(least / BOUNDS_ROOM), float(greatest * BOUNDS_ROOM)
     return bounds
-
-
-def inside_ellipsoid(errors: Array, covariances: Array, confidence: float = 0.95) -> float:
-    """Share of the errors (N, 6) inside the confidence ellipsoid of their covariances (N, 6, 6)."""
-    return share_inside(normalised_errors(errors, covariances), confidence)
 
 
 def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: dict[str, str], results: dict[str, float]) -> None:

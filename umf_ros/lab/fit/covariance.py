@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -28,6 +27,7 @@ from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
 from umf_ros.lab.simulation.domains.pairs import QUICK, SAME, TURNED, pairs_of, places_of
+from umf_ros.lab.simulation.drives import kept_in
 from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.runs.truth import MEDIAN_EXPECTED, normalised_errors, pose_error, share_inside
 from umf_ros.verification.hypothesis import SCAN
@@ -220,14 +220,7 @@ def right_sample(match: Keyframe, query: Keyframe, guess: Array, true: Array) ->
 def remembered(folder: Path | None, name: str, find: Callable[[], Iterable[PoseSample]]) -> list[PoseSample]:
     """Samples that an earlier call left in the folder, else new ones."""
     path = None if folder is None else folder / f"{name}.samples.pkl"
-    if path is not None and path.exists():
-        samples: list[PoseSample] = pickle.loads(path.read_bytes())
-        return samples
-    found = list(find())
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(pickle.dumps(found))
-    return found
+    return kept_in(path, lambda: list(find()))
 
 
 if __name__ == "__main__":

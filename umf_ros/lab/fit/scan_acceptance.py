@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import pickle
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -39,7 +38,7 @@ from umf_ros.lab.simulation.domains.pairs import (
     pairs_of,
     places_of,
 )
-from umf_ros.lab.simulation.drives import SurveyedDrive, embedded, kept, worlds
+from umf_ros.lab.simulation.drives import SurveyedDrive, embedded, kept, kept_in, worlds
 from umf_ros.lab.simulation.scenes import TRAPS
 from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.places.database import PlaceDatabase
@@ -92,14 +91,7 @@ def kept_examples(
 ) -> list[Example]:
     """The same as `examples_of`, from a file in the folder `kept` where an earlier call left it."""
     path = kept / f"examples_{domain.name}_{seeds.start}_{len(seeds)}_{pairs}.pkl" if kept else None
-    if path is not None and path.exists():
-        found: list[Example] = pickle.loads(path.read_bytes())
-        return found
-    found = list(examples_of(domain, seeds, pairs, scans, embedder))
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(pickle.dumps(found))
-    return found
+    return kept_in(path, lambda: list(examples_of(domain, seeds, pairs, scans, embedder)))
 
 
 def examples_of(domain: Domain, seeds: range, pairs: int, scans: Path | None, embedder: Embedder) -> Iterator[Example]:

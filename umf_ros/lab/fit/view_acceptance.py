@@ -11,7 +11,6 @@ written; everything else in the file stays.
 from __future__ import annotations
 
 import math
-import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,11 +34,18 @@ from umf_ros.lab.fit.acceptance import (
     Example,
     fit_covariance,
     fit_logistic,
-    inside_ellipsoid,
     save_acceptance,
 )
+from umf_ros.lab.simulation.drives import kept_in
 from umf_ros.places.database import Mask, is_past
-from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, POSE_TOLERANCE_DEG, POSE_TOLERANCE_M
+from umf_ros.runs.truth import (
+    PLACE_ANGLE_DEG,
+    PLACE_RADIUS_M,
+    POSE_TOLERANCE_DEG,
+    POSE_TOLERANCE_M,
+    normalised_errors,
+    share_inside,
+)
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import AcceptanceModel, Logistic, load_acceptance, scores
 from umf_ros.verification.hypothesis import IMAGE, Hypothesis
@@ -153,7 +159,7 @@ def fit(findings: list[ViewFinding]) -> tuple[AcceptanceModel, dict[str, float]]
         "image_recall_without_odometry": float(accepted[right & ~tracked].mean()),
         "image_wrong_held_out": float((accepted & ~right).sum()),
         "image_strictness": strictness,
-        "image_inside_95": inside_ellipsoid(errors, covariance_of(informations, covariance)),
+        "image_inside_95": share_inside(normalised_errors(errors, covariance_of(informations, covariance))),
     }
     fitted = fit_logistic([finding.example for finding in findings], IMAGE, RIDGE)
     return AcceptanceModel({IMAGE: Logistic(fitted.bias - strictness, fitted.weights)}, {IMAGE: covariance}), results
@@ -203,15 +209,7 @@ def _untracked(keyframe: Keyframe) -> Keyframe:
 
 def kept(folder: Path | None, bag: Path) -> Recording:
     """The keyframes of a recording without its scans, from a file in the folder where an earlier call left it."""
-    path = folder / f"{bag.stem}.pkl" if folder else None
-    if path is None or not path.exists():
-        recording = read(bag)
-        if path is None:
-            return recording
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(pickle.dumps(recording))
-    found: Recording = pickle.loads(path.read_bytes())
-    return found
+    return kept_in(folder / f"{bag.stem}.pkl" if folder else None, lambda: read(bag))
 
 
 def read(bag: Path) -> Recording:

@@ -97,13 +97,8 @@ def camera_info_message(camera: StereoCamera, stamp_ns: int, frame: str, right: 
     )
 
 
-def cloud_message(scan: Scan, stamp_ns: int, frame: str = "lidar") -> Any:
-    """sensor_msgs/PointCloud2 of all pulses, those without a return as points at 1 m with intensity 0."""
-    records = np.empty(len(scan.points), CLOUD_TYPE)
-    records["x"], records["y"], records["z"] = scan.points.T
-    records["intensity"], records["ambient_light"] = scan.intensity, scan.ambient
-    records["point_id"] = np.arange(len(records))
-    records["point_time_offset"] = scan.offset_ns
+def packed_cloud(records: NDArray[Any], stamp_ns: int, is_dense: bool) -> Any:
+    """sensor_msgs/PointCloud2 in the frame `lidar` of records, whose fields are of four bytes."""
     fields = [
         _new(
             "sensor_msgs/msg/PointField",
@@ -112,29 +107,39 @@ def cloud_message(scan: Scan, stamp_ns: int, frame: str = "lidar") -> Any:
             datatype=_FLOAT32 if kind.kind == "f" else _UINT32,
             count=1,
         )
-        for name, (kind, offset, *_) in (CLOUD_TYPE.fields or {}).items()
+        for name, (kind, offset, *_) in (records.dtype.fields or {}).items()
     ]
     return _new(
         "sensor_msgs/msg/PointCloud2",
-        header=_header(stamp_ns, frame),
+        header=_header(stamp_ns, "lidar"),
         height=1,
         width=len(records),
         fields=fields,
         is_bigendian=False,
-        point_step=CLOUD_TYPE.itemsize,
-        row_step=CLOUD_TYPE.itemsize * len(records),
-        data=records.view(np.uint8),
-        is_dense=False,
+        point_step=records.itemsize,
+        row_step=records.itemsize * len(records),
+        data=records.view(np.uint8).reshape(-1),
+        is_dense=is_dense,
     )
 
 
-def imu_message(rate: Array, force: Array, stamp_ns: int, frame: str = "imu") -> Any:
+def cloud_message(scan: Scan, stamp_ns: int) -> Any:
+    """sensor_msgs/PointCloud2 of all pulses, those without a return as points at 1 m with intensity 0."""
+    records = np.empty(len(scan.points), CLOUD_TYPE)
+    records["x"], records["y"], records["z"] = scan.points.T
+    records["intensity"], records["ambient_light"] = scan.intensity, scan.ambient
+    records["point_id"] = np.arange(len(records))
+    records["point_time_offset"] = scan.offset_ns
+    return packed_cloud(records, stamp_ns, is_dense=False)
+
+
+def imu_message(rate: Array, force: Array, stamp_ns: int) -> Any:
     """sensor_msgs/Imu without an orientation."""
     unknown = np.zeros(9)
     unknown[0] = -1
     return _new(
         "sensor_msgs/msg/Imu",
-        header=_header(stamp_ns, frame),
+        header=_header(stamp_ns, "imu"),
         orientation=_new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
         orientation_covariance=unknown,
         angular_velocity=_vector(rate),
@@ -166,11 +171,11 @@ def pose_message(pose: Array, stamp_ns: int, frame: str) -> Any:
     return _new("geometry_msgs/msg/PoseStamped", header=_header(stamp_ns, frame), pose=_pose(pose))
 
 
-def fix_message(geodetic: Array, deviation_m: float, stamp_ns: int, frame: str = "gnss") -> Any:
+def fix_message(geodetic: Array, deviation_m: float, stamp_ns: int) -> Any:
     """sensor_msgs/NavSatFix of latitude, longitude (deg) and height (m)."""
     return _new(
         "sensor_msgs/msg/NavSatFix",
-        header=_header(stamp_ns, frame),
+        header=_header(stamp_ns, "gnss"),
         status=_new("sensor_msgs/msg/NavSatStatus", status=2, service=1),
         latitude=float(geodetic[0]),
         longitude=float(geodetic[1]),
@@ -251,7 +256,7 @@ class BagWriter:
     own and is renamed when the context ends well; when it ends in an error nothing is left.
     """
 
-    def __init__(self, path: str | Path, library: str = "umf_ros") -> None:
+    def __init__(self, path: str | Path) -> None:
         """Open `path` for writing; an older file there is replaced at the end.
 
         Raises:
@@ -269,7 +274,7 @@ class BagWriter:
             self._stream: IO[bytes] = self._unfinished.open("wb")
         self._writer = Writer(self._stream, compression=CompressionType.LZ4)
         try:
-            self._guarded(self._writer.start, "ros2", library)
+            self._guarded(self._writer.start, "ros2", "umf_ros")
         except OutputError:
             self._discard()
             raise

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.progress import track
@@ -25,6 +25,7 @@ from umf_ros.lab.simulation.survey import Survey
 from umf_ros.lab.simulation.world import World, ground
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
+Made = TypeVar("Made")
 SPEED_M_S = 1.0
 STEP_M = 2.4  # between frames
 SCALE_ERROR, TURN_ERROR_RAD_M = 0.01, 0.001  # of the odometry, per metre driven
@@ -72,24 +73,23 @@ class SurveyedDrive:
         gap = relative(relative(self.truth[match], self.truth[query]), match_T_query)
         return float(np.linalg.norm(gap[:3, 3])), float(np.degrees(rotation_angle(gap)))
 
-    def error_vector(self, query: int, match: int, match_T_query: Array) -> Array:
-        """Error (6,) in ROS order, axes of the match."""
-        true = relative(self.truth[match], self.truth[query])
-        turn = Rotation.from_matrix(match_T_query[:3, :3] @ true[:3, :3].T).as_rotvec()
-        return np.concatenate([match_T_query[:3, 3] - true[:3, 3], turn])
 
-
-def kept(folder: Path | None, seed: int, family: str, aliasing: float, step_m: float = STEP_M) -> SurveyedDrive:
-    """The same as `simulate`, from a file in the folder where an earlier call left it."""
-    if folder is None:
-        return simulate(seed, family, aliasing, step_m)
-    path = folder / f"{seed}_{family}_{aliasing:g}_{step_m:g}.pkl"
+def kept_in(path: Path | None, make: Callable[[], Made]) -> Made:
+    """The content of a file, which is made where it is missing; without a path, it is made and not kept."""
+    if path is None:
+        return make()
     if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as part:
-            part.write_bytes(pickle.dumps(simulate(seed, family, aliasing, step_m)))
-    drive: SurveyedDrive = pickle.loads(path.read_bytes())
-    return drive
+            part.write_bytes(pickle.dumps(make()))
+    found: Made = pickle.loads(path.read_bytes())
+    return found
+
+
+def kept(folder: Path | None, seed: int, family: str, aliasing: float) -> SurveyedDrive:
+    """The same as `simulate`, from a file in the folder where an earlier call left it."""
+    path = None if folder is None else folder / f"{seed}_{family}_{aliasing:g}_{STEP_M:g}.pkl"
+    return kept_in(path, lambda: simulate(seed, family, aliasing))
 
 
 def simulate(seed: int, family: str, aliasing: float, step_m: float = STEP_M) -> SurveyedDrive:

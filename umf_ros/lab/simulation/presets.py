@@ -18,7 +18,6 @@ from umf_ros.lab.simulation.relief import Pan, Relief
 from umf_ros.lab.simulation.route import NIGHT, SETTINGS, Pass, Route, Walker, plan_passes
 from umf_ros.lab.simulation.survey import Survey
 from umf_ros.lab.simulation.world import World, check_seed, ground
-from umf_ros.sensors.calibration import Calibration
 
 SESSION_LOOP_M = 100.0
 """Length of the way that all sessions of a world share, each a part of it."""
@@ -244,17 +243,17 @@ THESIS_SAMPLES = 500
 _CHUNK = 100
 
 
-def etna_surveys(seed: int, calibration: Calibration | None = None) -> Iterator[tuple[str, Survey]]:
+def etna_surveys(seed: int) -> Iterator[tuple[str, Survey]]:
     """The seven sequences by name, each with the samples of the original, in one world."""
     aliasing = next(iter(ETNA.values())).aliasing
     relief = ground(seed, "etna", aliasing)
     world = World(seed, "etna", aliasing, next(iter(ETNA.values())).clearing(relief, seed), relief)
     for day, (name, preset) in enumerate(ETNA.items()):
         passes = sampled(preset, preset.route(relief, seed), seed, day)
-        yield name, Survey(world, passes, calibration)
+        yield name, Survey(world, passes)
 
 
-def thesis_surveys(seed: int, calibration: Calibration | None = None) -> Iterator[tuple[str, Survey]]:
+def thesis_surveys(seed: int) -> Iterator[tuple[str, Survey]]:
     """The thirteen synthetic sequences by name, each of 500 samples in a world of its own."""
     setting = SETTINGS["hard"]
     for name, (family, number) in THESIS.items():
@@ -265,7 +264,7 @@ def thesis_surveys(seed: int, calibration: Calibration | None = None) -> Iterato
         passes = first_samples(passes, THESIS_SAMPLES)
         clear = np.concatenate([drive.path for drive in passes])
         world = World(world_seed, family, setting.aliasing, clear, relief)
-        yield name, Survey(world, passes, calibration)
+        yield name, Survey(world, passes)
 
 
 def sampled(preset: Preset, route: Route, seed: int, day: int = 0) -> list[Pass]:

@@ -98,11 +98,6 @@ class Walker:
         self._labels: list[str] = []
         self._visited = np.zeros(len(self._points), bool)
 
-    @property
-    def trail_m(self) -> float:
-        """Length of the trail."""
-        return len(self._points) * STEP_M
-
     def forward(self, length_m: float, lateral_m: float = 0.0, label: str = "") -> Walker:
         """Follow the trail, up to `lateral_m` beside it; without a label, it is told by whether the place is new."""
         count = round(length_m / STEP_M)

@@ -56,7 +56,6 @@ class Trees:
         clear = np.array([distance_to(self.trail, place) > self.lateral_m + 0.7 for place in places])
         self._places = places[clear]
         self._sizes = rng.uniform(0.75, 1.25, len(self._places)) * (1.0 if regular else 1.8)
-        self._alike = regular
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Height of the ground under points, m."""

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure, ScanMotion
 from umf_ros.core.geometry import Array, relative, rotation_angle
-from umf_ros.core.io import atomic_write
 from umf_ros.detector import NOT_EMBEDDED, make_keyframe
 from umf_ros.embedding import Embedder
 from umf_ros.lab.scan_files import UNCALIBRATED, make_snapshot
@@ -21,6 +18,7 @@ from umf_ros.lab.simulation.domains import Domain, DomainScan, survey
 from umf_ros.lab.simulation.domains.passages import Passage
 from umf_ros.lab.simulation.domains.passages import drive as drive_passage
 from umf_ros.lab.simulation.domains.survey import FIRST, MOUNTS, OTHER_WAY, SAME_WAY
+from umf_ros.lab.simulation.drives import kept_in
 from umf_ros.sensors.decode import Cloud
 from umf_ros.submaps.history import DriftMeter, can_be_merged, needed_scans, submap_of
 from umf_ros.verification import Verifier
@@ -104,15 +102,8 @@ class ScanPair:
 def surveyed(domain: Domain, seed: int, extent: Extent, folder: Path | None) -> list[DomainScan]:
     """The scans of one world, from a file in the folder where an earlier call left it."""
     step_m, longest_m = extent.step_m / extent.scans, extent.longest_m + LEAD_M
-    if folder is None:
-        return survey(domain, seed, step_m, longest_m)
-    path = folder / f"{domain.name}_{seed}_{step_m:g}_{longest_m:g}.pkl"
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as part:
-            part.write_bytes(pickle.dumps(survey(domain, seed, step_m, longest_m)))
-    scans: list[DomainScan] = pickle.loads(path.read_bytes())
-    return scans
+    path = None if folder is None else folder / f"{domain.name}_{seed}_{step_m:g}_{longest_m:g}.pkl"
+    return kept_in(path, lambda: survey(domain, seed, step_m, longest_m))
 
 
 def keyframe_of(
@@ -246,9 +237,3 @@ def is_wrong(estimated: Array, true: Array) -> bool:
     """Whether a pose is more than 1 m or 5 deg from the truth."""
     gap = relative(true, estimated)
     return bool(np.linalg.norm(gap[:3, 3]) > WRONG_M or np.degrees(rotation_angle(gap)) > WRONG_DEG)
-
-
-def error_vector(estimated: Array, true: Array) -> Array:
-    """Error (6,) in ROS order, axes of the match."""
-    turn = Rotation.from_matrix(estimated[:3, :3] @ true[:3, :3].T).as_rotvec()
-    return np.concatenate([estimated[:3, 3] - true[:3, 3], turn])
