@@ -107,7 +107,7 @@ def test_the_version_is_the_package_s() -> None:
         (["explain", "a.mcap", "1"], "missing argument 'match'"),
         (["explain", "a.mcap", "soon", "1"], "'soon' is neither a stamp in ns nor seconds"),
         (["explain", "a.mcap", "5", "--", "-1"], "'-1' is before the start"),
-        (["explain", "a.mcap", "nan", "1"], "'nan' is before the start"),
+        (["explain", "a.mcap", "nan", "1"], "'nan' is neither a stamp in ns nor seconds"),
         (["why", "results", "-5"], "-5 is before the start"),
         (["export"], "missing argument 'out'"),
     ],

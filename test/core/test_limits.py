@@ -151,7 +151,7 @@ def test_poses_that_unpack_to_more_are_refused(
 ) -> None:
     monkeypatch.setattr(limits, "LARGEST_UNPACKED", 2**20)
     npz(tmp_path / POSES, 2**26, method, stated)
-    with little(10, 1), pytest.raises(UmfError, match=rf"cannot be read \(.*{text}.*run umf map") as caught:
+    with little(10, 1), pytest.raises(UmfError, match=rf"cannot be read \(.*{text}.*umf map edit") as caught:
         read_poses(tmp_path)
     assert "\n" not in str(caught.value)
 

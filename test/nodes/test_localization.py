@@ -147,4 +147,4 @@ def test_a_click_in_rviz_and_the_last_pose_are_poses_with_one_closure(
 def test_a_map_that_is_none_is_told_in_one_line(tmp_path: Path) -> None:
     process = Process(MODULE, tmp_path / "node.log", "mode:=localization", f"map:={tmp_path}", "dataset:=simulated")
     assert wait_until(lambda: process.exit_code is not None, 60.0) and process.exit_code == 1
-    assert "run umf map to solve the map" in (tmp_path / "node.log").read_text()
+    assert "solve the map with umf map edit" in (tmp_path / "node.log").read_text()

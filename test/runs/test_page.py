@@ -60,7 +60,7 @@ def test_text_stays_text_in_the_page_and_in_its_scripts(tmp_path: Path) -> None:
 def test_the_page_stands_alone_and_is_small(tmp_path: Path) -> None:
     page = written(examined(tmp_path, [closure(50, 10)]))
     library = re.search(r'<script type="text/plain" id="library">data:application/gzip;base64,([^<]*)</script>', page)
-    assert library and not re.search(r'(?:src|href)="(?!data:|#pair=)', page) and len(page) < 1_000_000
+    assert library and not re.search(r'(?:src|href)="(?!data:|#pair=)', page) and len(page) < 2_100_000
     assert b"Plotly" in gzip.decompress(base64.b64decode(library[1]))
 
 

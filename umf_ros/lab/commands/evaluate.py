@@ -266,8 +266,8 @@ def command(
     """
     _check(data, worlds, methods, trained)
     listed = data is not None and data.suffix in (".yaml", ".yml")
-    if data is not None:
-        check_files(Path() if listed else data, data, config, odometry, ground_truth)
+    if data is not None and not listed:
+        check_files(data, config, odometry, ground_truth)
 
     from umf_ros.lab.evaluation.places import lists_place_sets
 

@@ -35,8 +35,8 @@ def command(
     The tables and trajectories of a run that was killed are exported first. With the recording or the truth of another
     run, nothing is written.
     """
-    _check_run(folder)
     check_files(bag or Path(), ground_truth)
+    _check_run(folder)
 
     from rich.console import Console
 
