@@ -60,7 +60,7 @@ bench: install
 	@$(BIN)/python benchmarks/scale/cpu.py
 
 # every page and every link, as a site in build/site
-docs: export REPOSITORY_URL ?= $(shell git remote get-url origin 2>/dev/null | sed 's,^git@\(.*\):,https://\1/,; s,\.git$$,,')
+docs: export REPOSITORY_URL ?= $(shell git remote get-url origin 2>/dev/null | sed -n 's,^git@\([^:]*\):,https://\1/,; s,\.git$$,,; /^https*:/p')
 docs: install-dev
 	@$(BIN)/python tools/parameters_doc.py --check
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
