@@ -165,6 +165,22 @@ def test_the_table_lists_every_closure_with_its_errors(run: Path, bag: Path) -> 
     assert [row[5] for row in rows] == ["0.9900", "0.9500", "0.9123"]
 
 
+def test_the_page_shows_both_images_of_a_match_and_its_inliers(run: Path, bag: Path, tmp_path: Path) -> None:
+    report(run, bag)
+    scene = scene_of(run)
+    frames = {frame.stamp_ns: frame for frame in FrameReader(open_bag(bag), small_settings(tmp_path))}
+    closures = [pair for pair in scene["pairs"] if pair["number"]]
+    assert len(closures) == 3
+    for pair in closures:
+        assert pair["inliers"] == PIXELS.astype(int).tolist()
+        for stamp in pair["stamps"]:
+            address, width, height = scene["photographs"][stamp]
+            jpeg = np.frombuffer(base64.b64decode(address.partition(",")[2]), np.uint8)
+            image, shown = frames[int(stamp)].left, cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
+            assert image is not None and image.shape == (height, width) == shown.shape
+            assert np.abs(shown.astype(int) - image).mean() < 0.3 * image.std()  # reduced for the run's file
+
+
 def test_reporting_twice_gives_the_same(run: Path, bag: Path) -> None:
     report(run, bag)
     first = (run / "report.html").read_bytes(), (run / "summary.json").read_bytes()
