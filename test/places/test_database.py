@@ -105,6 +105,16 @@ def test_memory_is_bounded_and_every_keyframe_is_read_from_disk() -> None:
         assert_same(places[index], make_keyframe(index, seed=index))
 
 
+def test_a_stored_database_is_opened_again(tmp_path: Path) -> None:
+    first = database(tmp_path / "map.sqlite")
+    for i in range(5):
+        first.add(make_keyframe(i, i, seed=i))
+    first.close()
+    second = database(tmp_path / "map.sqlite")
+    assert len(second) == 5 and second.next_session == 1
+    assert_same(second[3], make_keyframe(3, 3, seed=3))
+
+
 def test_a_place_of_many_sessions_does_not_displace_the_others() -> None:
     rng = np.random.default_rng(0)
     query, elsewhere = rng.standard_normal((2, 16))
@@ -141,6 +151,20 @@ def test_a_duplicate_is_found_and_another_keyframe_of_its_stamp_is_not() -> None
     empty = np.empty((0, 3), np.float32)
     places.add(replace(make_keyframe(3, seed=2), points=empty))
     assert places.find_duplicate(replace(make_keyframe(3, seed=5), points=empty)) is None
+
+
+def test_saving_copies_everything(tmp_path: Path) -> None:
+    places = database()
+    places.add(make_keyframe(1))
+    places.store.save(tmp_path / "sub" / "copy.sqlite")
+    places.add(make_keyframe(2))
+    assert len(database(tmp_path / "sub" / "copy.sqlite")) == 1
+
+
+def test_a_database_of_another_embedder_is_refused(tmp_path: Path) -> None:
+    database(tmp_path / "map.sqlite").close()
+    with pytest.raises(UmfError, match="made with embedder test, not other"):
+        database(tmp_path / "map.sqlite", embedder="other")
 
 
 def test_a_foreign_file_is_refused(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from conftest import make_keyframe, unit
 from umf_ros.core.config import Database, Loop
 from umf_ros.places import database as database_module
 from umf_ros.places.database import PlaceDatabase, PlaceIndex
-from umf_ros.places.store import delete_sessions, index_path
+from umf_ros.places.store import KeyframeStore, delete_sessions, index_path
 
 DIMENSION = 16
 
@@ -208,3 +208,11 @@ def test_a_search_leaves_the_threads_of_the_network_alone() -> None:
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_store_of_half_its_descriptors_is_damage_and_not_a_crash(tmp_path: Path) -> None:
+    opened = KeyframeStore(tmp_path / "map.sqlite", ("test", 16), 20)
+    opened.add(make_keyframe(0, descriptor=np.ones(8, np.float32)))
+    opened.close()
+    with pytest.raises(Exception, match=r"map\.sqlite is damaged"):
+        database(tmp_path / "map.sqlite")

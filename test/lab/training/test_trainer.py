@@ -19,7 +19,7 @@ from umf_ros.lab.datasets.sample import Rule
 from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
 from umf_ros.lab.datasets.views import Augmentation, ViewMaker
 from umf_ros.lab.training.batches import BatchMaker, PairSampler, places_drawn
-from umf_ros.lab.training.metric_objective import MetricObjective, rule_of
+from umf_ros.lab.training.metric_objective import MetricObjective, rule_of, validate
 from umf_ros.lab.training.networks import read_card
 from umf_ros.lab.training.trainer import Team, Trainer, load_run, train
 from umf_ros.networks.umf import UMF
@@ -239,6 +239,20 @@ def test_early_stopping(folder, tmp_path):
     steps = []
     train(settings, tmp_path / "run", False, lambda progress: steps.append(progress.step))
     assert len(steps) < 40
+
+
+def test_weights_of_another_image_size_can_start_a_run(folder, tmp_path):
+    first = train(settings_for(folder, steps=2), tmp_path / "a", False, silent)
+    second = train(settings_for(folder, steps=2, start=str(first), image_size=(32, 64)), tmp_path / "b", False, silent)
+    assert load_weights(second).config == replace(TINY, image_size=(32, 64))
+    with pytest.raises(ConfigError, match="is not a umf_light"):
+        train(settings_for(folder, preset="umf_light", start=str(first)), tmp_path / "c", False, silent)
+
+
+def test_validation_of_a_perfect_world(world):
+    found = validate(UMF(TINY), [world])[world.name]
+    # the passes of this world show the same images and scans
+    assert found["fused"].recall1 == found["image"].recall1 == found["cloud"].recall1 == 1
 
 
 def test_new_worlds_are_picked_up(folder):
