@@ -99,7 +99,7 @@ def _remedy(package: str) -> str:
     """Return the source of a missing package."""
     known = dict.fromkeys(LAB_PACKAGES, "the lab needs it: run pip install 'umf_ros[lab]'")
     known |= dict.fromkeys(FLEET_PACKAGES, "run pip install 'umf_ros[fleet]'")
-    known["torch"] = "run pip install 'umf_ros[torch]', or make install-dev"
+    known |= {"torch": "run pip install 'umf_ros[torch]', or make install-dev"}
     return known.get(package, "run umf doctor for a remedy")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from contextlib import closing
 from pathlib import Path
 
@@ -44,6 +45,16 @@ def test_odometry_is_read_back_as_it_was(folder: MapFolder) -> None:
     assert [one.stamp_ns for one in got] == [one.stamp_ns for one in put]
     for ours, theirs in zip(got, put, strict=True):
         np.testing.assert_array_equal(ours.odom_T_body, theirs.odom_T_body)
+
+
+def test_estimates_of_an_earlier_release_are_refused(folder: MapFolder) -> None:
+    run = folder.folder_of("a")
+    with closing(RunFile(run)) as file:
+        file.append_odometry(messages(0)[0])
+    with closing(sqlite3.connect(run / "run.sqlite")) as connection, connection:
+        connection.execute("UPDATE odometry SET covariance = zeroblob(288)")
+    with pytest.raises(UmfError, match="only estimates between keyframes: map it again"):
+        folder.inputs_of("a")
 
 
 def test_a_graph_gets_it_on_another_clock_and_in_its_sessions() -> None:

@@ -215,6 +215,13 @@ def test_a_second_process_may_not_write_the_same_folder(tmp_path: Path) -> None:
     recorder.close()
 
 
+def test_tables_of_an_older_release_are_set_aside(tmp_path: Path) -> None:
+    (tmp_path / "closures.csv").write_text("a,b\n1,2\n")
+    record_a_little(tmp_path).close()
+    assert (tmp_path / "closures.1.csv").read_text() == "a,b\n1,2\n"
+    assert len(read_closures(tmp_path / "closures.csv")) == 1
+
+
 def test_descriptors_come_back_by_stamp(tmp_path: Path) -> None:
     record_a_little(tmp_path).close()
     found = read_descriptors(tmp_path)

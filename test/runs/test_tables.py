@@ -71,6 +71,12 @@ def test_closures_come_back_as_they_were(tmp_path: Path) -> None:
         assert ours.probability == pytest.approx(theirs.probability)
 
 
+def test_a_table_of_an_older_version_has_one_sigma_per_axis(tmp_path: Path) -> None:
+    put = closure()
+    (got,) = read_closures(written(tmp_path / "closures.csv", [closure_row(put, 0.5)[:-1]], CLOSURES[:-1]))
+    np.testing.assert_allclose(got.covariance, np.diag(np.diag(put.covariance)), rtol=1e-7)
+
+
 def test_a_table_without_rows_holds_no_closure(tmp_path: Path) -> None:
     assert read_closures(written(tmp_path / "closures.csv", [])) == []
 
@@ -124,16 +130,16 @@ def test_a_folder_that_is_gone_is_one_clear_line(tmp_path: Path) -> None:
     ("content", "line"),
     [
         ("query_stamp_ns,match_stamp_ns\n1,2\n", 2),
-        (",".join(CLOSURES) + "\n" + ",".join(["1"] * 18) + "\n" + "1,2,3\n", 3),
-        (",".join(CLOSURES) + "\n" + ",".join(["one"] * 18) + "\n", 2),
-        (",".join(CLOSURES) + "\n" + ",".join(["1"] * 2 + ["0"] * 16) + "\n", 2),  # no unit quaternion
+        (",".join(CLOSURES) + "\n" + ",".join(["1"] * 17) + "\n" + "1,2,3\n", 3),
+        (",".join(CLOSURES) + "\n" + ",".join(["one"] * 17) + "\n", 2),
+        (",".join(CLOSURES) + "\n" + ",".join(["1"] * 2 + ["0"] * 15) + "\n", 2),  # no unit quaternion
     ],
 )
 def test_the_line_that_is_damaged_is_named(tmp_path: Path, content: str, line: int) -> None:
     path = tmp_path / "closures.csv"
     path.write_text(content)
     if line == 3:
-        path.write_text(content.replace(",".join(["1"] * 18), ",".join(["1"] * 2 + ["0"] * 6 + ["1"] * 10)))
+        path.write_text(content.replace(",".join(["1"] * 17), ",".join(["1"] * 2 + ["0"] * 6 + ["1"] * 9)))
     with pytest.raises(UmfError, match=rf"closures\.csv, line {line}: not a row of this table") as caught:
         read_closures(path)
     assert "\n" not in str(caught.value)

@@ -35,14 +35,8 @@ _PACKAGES = {
     "plotly": ("plotly", "6"),
 }
 """Distribution and first version known to work, by module."""
-_RUNTIMES = {
-    "openvino": ("2025", "torch", "torch runs the network instead (OpenVINO asks for glibc 2.35)"),
-    "torch": (
-        *("2.4", "openvino"),
-        "training, umf evaluate, a GPU and other weights need it: pip install 'umf_ros[torch]'",
-    ),
-}
-"""First version known to work, the other one, of which one is enough, and the consequence, by module."""
+_WITHOUT_OPENVINO = "torch runs the network instead (OpenVINO asks for glibc 2.35)"
+_WITHOUT_TORCH = "training, umf evaluate, a GPU and other weights need it: pip install 'umf_ros[torch]'"
 _WITHOUT_LAB = "only the lab needs it: pip install 'umf_ros[lab]'"
 _MESSAGE_PACKAGES = ("sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "visualization_msgs", "std_srvs")
 
@@ -94,11 +88,9 @@ def checks() -> Iterator[tuple[str, Callable[[], Finding]]]:
     yield "Python", check_python
     for module, (distribution, minimum) in _PACKAGES.items():
         yield distribution, partial(check_package, module, distribution, minimum)
-    for module, (minimum, other, without) in _RUNTIMES.items():
-        yield (
-            module,
-            partial(check_package, module, module, minimum, without if importlib.util.find_spec(other) else ""),
-        )
+    one_runs = any(map(importlib.util.find_spec, ("openvino", "torch")))
+    yield "openvino", partial(check_package, "openvino", "openvino", "2025", _WITHOUT_OPENVINO if one_runs else "")
+    yield "torch", partial(check_package, "torch", "torch", "2.4", _WITHOUT_TORCH if one_runs else "")
     for module, (distribution, minimum) in LAB_PACKAGES.items():
         yield distribution, partial(check_package, module, distribution, minimum, _WITHOUT_LAB)
     yield "ROS 2 Python", check_rclpy

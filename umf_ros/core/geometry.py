@@ -96,8 +96,8 @@ def interpolate(a: Array, b: Array, fraction: ArrayLike) -> Array:
     Fractions (...) outside [0, 1] extrapolate at the same rate.
     """
     share = np.asarray(fraction, float)[..., None]
-    moved = np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3]
-    turn = Rotation.from_matrix(moved, assume_valid=True).as_rotvec()  # the check takes nine tenths of the time
+    # the check of validity takes nine tenths of the time
+    turn = Rotation.from_matrix(np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3], assume_valid=True).as_rotvec()
     pose = np.array(a, float)
     pose[..., :3, :3] = a[..., :3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
     pose[..., :3, 3] = (1 - share) * a[..., :3, 3] + share * b[..., :3, 3]

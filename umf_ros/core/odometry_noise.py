@@ -60,8 +60,7 @@ class OdometryNoise:
 
     def path_lengths(self, a: Array, b: Array, elapsed_s: Array) -> Array:
         """Return (N,) path lengths in metres of the steps from (N, 4, 4) poses `a` to `b` in (N,) seconds."""
-        turned = np.swapaxes(a[:, :3, :3], -1, -2) @ b[:, :3, :3]
-        turns = Rotation.from_matrix(turned, assume_valid=True).magnitude()
+        turns = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], -1, -2) @ b[:, :3, :3], assume_valid=True).magnitude()
         moved = np.linalg.norm(b[:, :3, 3] - a[:, :3, 3], axis=1)
         return np.asarray(moved + _M_PER_RAD * turns + _M_PER_S * elapsed_s)
 

@@ -68,7 +68,8 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     thickness = {name: None if isnan(value) else round(value, 4) for name, value in found.items()}
     summary = summarise(joint) | {"thickness_m": thickness, "ground": ground, "world": None}
     for one in summary["sessions"]:
-        one["findings"] = _findings(folder.folder_of(one["name"]))
+        run = folder.folder_of(one["name"])  # no recording was replayed for some drives
+        one["findings"] = read_summary(run).get("findings", []) if (run / "summary.json").is_file() else []
     if joint.world is not None:
         world_T_map, origin = joint.world
         summary["world"] = {"origin": origin.tolist(), "world_T_map": world_T_map.tolist()}
@@ -77,11 +78,6 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     write_atomically(path / "summary.json", json.dumps(summary, indent=2) + "\n")
     _write_report(path, summary)
     return summary
-
-
-def _findings(run: Path) -> list[str]:
-    """Return the findings about the recording of a session; none of a drive that no recording was replayed for."""
-    return read_summary(run).get("findings", []) if (run / "summary.json").is_file() else []
 
 
 def summarise(joint: JointMap) -> dict[str, Any]:

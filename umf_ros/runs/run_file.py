@@ -12,6 +12,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteReason, AbsoluteVerdict, Aid
-from umf_ros.core.errors import UmfError
+from umf_ros.core.errors import UmfError, writing
 from umf_ros.core.frames import Candidate, LoopClosure, Points
 from umf_ros.core.geometry import Array, from_quaternion, to_quaternion
 from umf_ros.core.io import Schema, SqliteFile, write_table
@@ -111,6 +112,8 @@ class RunFile:
     def __init__(self, folder: Path, read_only: bool = False) -> None:
         self._folder, self._path = folder, folder / NAME
         self._read_only = read_only
+        if not read_only and not self._path.exists():
+            _set_aside(folder)
         self._file = SqliteFile(self._path, SCHEMA, read_only=read_only)
         self._received = 0
         self._odometry: deque[tuple[int, int, bytes]] = deque()
@@ -174,10 +177,15 @@ class RunFile:
             return [parse_closure(dict(zip(CLOSURES, row, strict=True))) for row in self.rows("closures")]
 
     def odometry(self) -> list[OdometrySample]:
-        """Return the odometry of the run in the order of arrival."""
+        """Return the odometry of the run in the order of arrival.
+
+        An `UmfError` refuses poses that an earlier release estimated from keyframe to keyframe.
+        """
         found = []
         with self._file.reading() as connection:
-            for stamp_ns, data in connection.execute("SELECT stamp_ns, odom_T_body FROM odometry ORDER BY number"):
+            for _, stamp_ns, data, estimated in connection.execute("SELECT * FROM odometry ORDER BY number"):
+                if estimated is not None:
+                    raise UmfError(f"{self._path} has no odometry, only estimates between keyframes: map it again")
                 pose = np.vstack([np.frombuffer(data, np.float64).reshape(3, 4), (0, 0, 0, 1)])
                 found.append(OdometrySample(int(stamp_ns), pose))
         return found
@@ -229,6 +237,13 @@ class RunFile:
         if not self._read_only:
             with suppress(OSError):
                 self._path.with_name(f"{NAME}.lock").unlink()
+
+
+def _set_aside(folder: Path) -> None:
+    """Rename the tables of an earlier release, which a new run would overwrite."""
+    for path in [found for name in COLUMNS if (found := folder / f"{name}.csv").exists()]:
+        with writing(path):
+            path.rename(next(name for i in count(1) if not (name := path.with_suffix(f".{i}.csv")).exists()))
 
 
 def read_descriptors(folder: Path) -> dict[int, Points]:
@@ -347,19 +362,21 @@ def read_inliers(path: Path) -> dict[Endpoints, Array]:
 
 
 def read_closures(path: Path) -> list[LoopClosure]:
-    """Return the closures of a `closures.csv`."""
+    """Return the closures of a `closures.csv`; with a diagonal covariance from an older version."""
     return read_table(path, parse_closure)
 
 
 def parse_closure(row: Mapping[str, Any]) -> LoopClosure:
     """Return the closure in a row of `closures.csv`."""
     numbers = [float(row[name]) for name in CLOSURES[2:16]]
-    upper = np.zeros((6, 6))
-    upper[np.triu_indices(6)] = [float(number) for number in (row["covariance"] or "").split()]
+    covariance = np.diag(np.square(numbers[7:13]))
+    if triangle := (row.get("covariance") or "").split():
+        covariance[np.triu_indices(6)] = [float(number) for number in triangle]
+        covariance = np.triu(covariance) + np.triu(covariance, 1).T
     return LoopClosure(
         query_stamp_ns=int(row["query_stamp_ns"]),
         match_stamp_ns=int(row["match_stamp_ns"]),
         match_T_query=from_quaternion(numbers[:3], numbers[3:7]),
-        covariance=upper + np.triu(upper, 1).T,
+        covariance=covariance,
         probability=numbers[13],
     )
