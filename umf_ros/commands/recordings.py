@@ -128,12 +128,9 @@ class ChosenOdometry:
     @classmethod
     def parse(cls, choice: str | None, frame: str) -> ChosenOdometry:
         """Return the choice of `--odometry` and `--odometry-frame`; raise a `ConfigError` if they do not fit."""
-        if choice == "none":
+        if choice in (None, "none") or (choice in ENGINES and not Path(choice).exists()):
             check_odometry_options(None, frame)
-            return cls(None, "body")
-        if choice is None or (choice in ENGINES and not Path(choice).exists()):
-            check_odometry_options(None, frame)
-            return cls(None, "body", choice or ENGINES[0], choice is not None)
+            return cls(None, "body", "" if choice == "none" else choice or ENGINES[0], choice in ENGINES)
         return cls(Path(choice), check_odometry_options(Path(choice), frame))
 
     def read(

@@ -79,13 +79,6 @@ def write_atomically(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-def check_absent(*paths: Path) -> None:
-    """Raise an `OutputError` if one of some files, which a person may have changed, would be overwritten."""
-    for path in paths:
-        if path.exists():
-            raise OutputError(f"{path} is there already: nothing was written")
-
-
 def check_writable(folder: Path) -> None:
     """Make a folder and check that results can be written into it, before hours of work.
 

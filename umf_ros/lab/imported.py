@@ -12,8 +12,9 @@ import yaml
 
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
 from umf_ros.core.config import Topics
+from umf_ros.core.errors import OutputError
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
-from umf_ros.core.io import check_absent, write_atomically
+from umf_ros.core.io import write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.lab.scan_files import SensorFileError, read_image
 from umf_ros.lab.simulation.bag_writer import BagWriter, image_message, packed_cloud, pose_message
@@ -79,6 +80,14 @@ TOPICS = Topics(
     odometry="",
 )
 """Of an imported recording: those of no known data set, whose calibration it does not have."""
+
+
+def check_absent(*paths: Path) -> None:
+    """Raise an `OutputError` if one of some files, which a person may have changed, would be overwritten."""
+    for path in paths:
+        if path.exists():
+            raise OutputError(f"{path} is there already: nothing was written")
+
 
 Entry = tuple[int, str, Callable[[], Any]]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.bags.reader import Bag, stamp_span
-from umf_ros.bags.trajectories import read_tum
+from umf_ros.bags.trajectories import read_ground_truth, read_tum
 from umf_ros.core.config import Settings, load_settings, topics_of
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure, Points
@@ -21,6 +21,8 @@ from umf_ros.runs import run_file
 from umf_ros.runs.writer import read_summary, write_summary
 from umf_ros.verification.hypothesis import Hypothesis
 
+TRUTH = "trajectory_truth.tum"
+"""Truth that a run was judged by last."""
 CLOCK_SLACK_NS = 5_000_000_000
 """Largest difference of stamps of sensors from the times of recording."""
 
@@ -123,6 +125,12 @@ def _check_recording(run: FinishedRun, bag: Bag) -> None:
             f"{run.folder} was made on another recording than {bag.path}: {len(outside)} of {len(run.keyframes)} "
             f"keyframes are outside its time, the first at {outside[0]} ns; nothing was written"
         )
+
+
+def find_truth(folder: Path, bag: Bag | None, path: Path | None) -> Trajectory | None:
+    """Return the truth of a file; without one that which the run was judged by last, else the recording's, or None."""
+    kept = read_trajectory(folder / TRUTH) if path is None else None
+    return kept or read_ground_truth(bag, path)
 
 
 def read_trajectory(path: Path) -> Trajectory | None:

@@ -20,9 +20,10 @@ from umf_ros.bags.inputs import Advice
 from umf_ros.bags.reader import Bag
 from umf_ros.core.errors import command_line
 from umf_ros.core.io import write_atomically
+from umf_ros.core.trajectory import write_tum
 from umf_ros.pose_graph.closures import State
 from umf_ros.runs.findings import RunVerdict, conclude, judge, look_first
-from umf_ros.runs.reader import FinishedRun
+from umf_ros.runs.reader import TRUTH, FinishedRun
 from umf_ros.runs.run_file import NAME, read_inliers
 from umf_ros.runs.scene import (
     build_scene,
@@ -122,7 +123,7 @@ def closure_rows(about: JudgedRun) -> list[list[str]]:
         figures = [f"{at_s:.1f}", f"{back_s:.1f}", f"{shift_m:.2f}", f"{turn_deg:.1f}", f"{closure.probability:.4f}"]
         errors = ["", "", "", ""]
         if judged is not None:
-            errors = [f"{value:.3g}" for value in (judged.translation_error_m, judged.rotation_error_deg, judged.nees)]
+            errors = [f"{judged.translation_error_m:.3f}", f"{judged.rotation_error_deg:.2f}", f"{judged.nees:.3g}"]
             errors.append("yes" if judged.is_true else "NO")
         rows.append([str(number), *figures, verdict.state if verdict else "", *errors])
     return rows
@@ -195,8 +196,10 @@ def finish_run(
         printed: lines that were printed before the run, and are not repeated.
     """
     with console.status("Judging and writing the report"):
-        run.summary["self_check"] = _judged_by_itself(run)
+        run.summary["self_check"] = run.summary.get("self_check") or _judged_by_itself(run)
         about = replace(judge(run, bag), sensors=sensors)
+        if run.truth is not None and about.covered[0]:
+            write_tum(run.folder / TRUTH, run.truth)
         inliers = read_inliers(run.folder / "inliers.csv")
         pairs = pairs_of(about)
         shown = {stamp for key in by_need(pairs)[:MAX_SHOWN] for stamp in key}

@@ -309,7 +309,7 @@ def _map_picture(heights: HeightMap | None) -> dict[str, Any] | None:
     if heights is None or (drawn := heights.draw()) is None:
         return None
     webp = cv2.imencode(".webp", drawn[0], [cv2.IMWRITE_WEBP_QUALITY, 75])[1].tobytes()
-    corners = {"lower": heights.lower.tolist(), "upper": heights.upper.tolist()}
+    corners = {"lower": np.round(heights.lower, 3).tolist(), "upper": np.round(heights.upper, 3).tolist()}
     return corners | {"address": data_address("image/webp", webp)}
 
 

@@ -69,9 +69,6 @@ def world(name: str, recall1: float, yaw: list[YawBin], **others: Scores) -> Wor
         yaw=yaw,
         by_candidates={"ransac": np.linspace(recall1, 1, 20)},
         milliseconds={"superfeatures": 4.0, "ransac": 20 * recall1},
-        descriptors=np.zeros((1, 2)),
-        world_T_body=np.eye(4)[None],
-        pass_index=np.zeros(1, np.int64),
     )
 
 

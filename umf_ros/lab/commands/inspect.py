@@ -96,8 +96,9 @@ def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> 
     """Write a parameter file and a calibration; return the path of the former."""
     from umf_ros.bags.frames import read_transforms
     from umf_ros.core.errors import writing
-    from umf_ros.core.io import check_absent, write_atomically
+    from umf_ros.core.io import write_atomically
     from umf_ros.lab.evaluation.inspection import GUESS, calibration_of_dataset, write_calibration, write_settings
+    from umf_ros.lab.imported import check_absent
 
     settings, calibration = folder / "my_rover.yaml", folder / "my_calibration.yaml"
     check_absent(settings, calibration)

@@ -79,13 +79,13 @@ def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | No
     Raises:
         UmfError: the run was made on another recording; nothing is written.
     """
-    from umf_ros.bags.trajectories import read_ground_truth, read_odometry
+    from umf_ros.bags.trajectories import read_odometry
     from umf_ros.lab.evaluation.inspection import check_sensors
-    from umf_ros.runs.reader import read_run
+    from umf_ros.runs.reader import find_truth, read_run
     from umf_ros.runs.report import finish_run
     from umf_ros.sensors.sensor_check import SensorReport
 
-    run = read_run(folder, bag, read_ground_truth(bag, ground_truth))
+    run = read_run(folder, bag, find_truth(folder, bag, ground_truth))
     if known := run.summary.get("sensors"):
         with reading(folder / "summary.json", UmfError, "is damaged"):
             sensors = SensorReport.from_json(known)
@@ -118,18 +118,17 @@ def why(
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
-    from umf_ros.bags.trajectories import read_ground_truth
     from umf_ros.commands.console import waiting
     from umf_ros.runs.diagnosis import explain
     from umf_ros.runs.findings import judge
-    from umf_ros.runs.reader import read_run
+    from umf_ros.runs.reader import find_truth, read_run
 
     console = Console()
     with waiting(console, "Reading the run"):
         recover_run(folder)
         known = bag or recording_of(folder)
         recording: Bag | None = None if known is None else open_bag(known)
-        truth = read_ground_truth(recording, ground_truth)
+        truth = find_truth(folder, recording, ground_truth)
         about = judge(read_run(folder, recording, truth), recording, keep=False)
     if not len(about.run.keyframes):
         raise UmfError(f"{folder} holds no keyframe")

@@ -97,7 +97,7 @@ def command(
 
     from rich.console import Console
 
-    from umf_ros.core.io import check_absent
+    from umf_ros.lab.imported import check_absent
 
     console = Console()
     if str(out) == TWIN:

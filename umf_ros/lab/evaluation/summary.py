@@ -18,7 +18,7 @@ from umf_ros.core.geometry import Array
 from umf_ros.embedding import Embedder
 from umf_ros.embedding.umf import UmfEmbedder
 from umf_ros.lab.evaluation.results import Figures, Scores, TextTable, YawBin, mean, percent, rounded, scores_table
-from umf_ros.lab.evaluation.retrieval import METHODS, RERANKERS, TOP_K, Indices
+from umf_ros.lab.evaluation.retrieval import METHODS, RERANKERS, TOP_K
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.weights import load_weights
 from umf_ros.sensors.calibration import load_calibration
@@ -77,9 +77,6 @@ class WorldResult:
         yaw: recall@1 by difference of heading, opposite direction included.
         by_candidates: (K,) recall@1 by number of reranked candidates, by reranker.
         milliseconds: of the rerankers per query.
-        descriptors: (N, D) fused.
-        world_T_body: (N, 4, 4).
-        pass_index: (N,).
         examples: frames of queries and of their best match after RANSAC.
     """
 
@@ -89,9 +86,6 @@ class WorldResult:
     yaw: list[YawBin]
     by_candidates: dict[str, Array]
     milliseconds: dict[str, float]
-    descriptors: Array
-    world_T_body: Array
-    pass_index: Indices
     examples: list[tuple[Frame, Frame]] = field(default_factory=list)
 
 

@@ -13,7 +13,6 @@ from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import WORDS_WEIGHT, Frame, ScanMotion
 from umf_ros.core.geometry import Array
 from umf_ros.embedding import Embedder, make_embedder
-from umf_ros.lab.evaluation.network_plots import look, plot_embeddings, plot_keypoints, plot_superfeatures
 from umf_ros.lab.evaluation.results import (
     EvaluationReport,
     Scores,
@@ -43,7 +42,6 @@ from umf_ros.lab.simulation.route import SETTINGS, Pass, plan_passes, thinned
 from umf_ros.lab.simulation.survey import Survey, SurveyFrame
 from umf_ros.lab.simulation.world import TEST, VALIDATION, World, ground
 from umf_ros.networks.config import locate_weights
-from umf_ros.networks.weights import load_weights
 from umf_ros.sensors.calibration import Calibration, load_calibration
 
 WORLDS = 4
@@ -183,7 +181,7 @@ ASKED = {
     "fused, words": ("fused", "fused", 1.0, WORDS_WEIGHT),
 }
 SHOWN = 3
-"""Queries whose frames are kept for pictures."""
+"""Queries whose frames are kept, to take times."""
 
 RERANKED = ("fused", "superfeatures both", "ransac both")
 TIMED_FRAMES = 8
@@ -191,9 +189,6 @@ PICTURES = {
     "Precision and recall (figure 5.13)": "precision_recall.png",
     "Recall among the first candidates": "recall.png",
     "Recall@1 by number of reranked candidates (figure 5.12)": "candidates.png",
-    "Descriptors in the plane (figures 5.10 and 5.11)": "embeddings.png",
-    "Attention of super-features on images and voxels (figures 5.5 to 5.7)": "superfeatures.png",
-    "Key-points and fusion (figure 5.8)": "keypoints.png",
 }
 
 
@@ -238,9 +233,6 @@ class WorldEvaluation:
             yaw=self._recall_by_yaw(),
             by_candidates={name: reranking.recall1_by_candidates(f"{name} both", task.positive) for name in RERANKERS},
             milliseconds=reranking.milliseconds,
-            descriptors=self._places.descriptors("fused"),
-            world_T_body=np.stack(self._poses),
-            pass_index=np.array(self._passes),
             examples=self._examples(task, reranking.after("ransac both")),
         )
 
@@ -325,7 +317,7 @@ class WorldsRun:
         return WorldsSummary(results, cost_of_weights(self._weights, frames, self._repeats))
 
     def write(self, summary: WorldsSummary, folder: Path, notes: list[str]) -> EvaluationReport:
-        """Write tables, figures and pictures.
+        """Write tables and figures.
 
         Raises:
             OutputError: the folder cannot be written.
@@ -348,17 +340,6 @@ class WorldsRun:
             for name in results[0].by_candidates
         }
         plot_recall(folder / "candidates.png", by_count, "candidates reranked")
-        first = results[0]
-        plot_embeddings(folder / "embeddings.png", first.descriptors, first.world_T_body, first.pass_index, first.name)
-        pairs = [result.examples[len(result.examples) // 2] for result in results if result.examples]
-        _draw_attention(folder, self._weights, self._embedder, pairs)
-
-
-def _draw_attention(folder: Path, weights: Path, embedder: Embedder, pairs: list[tuple[Frame, Frame]]) -> None:
-    network = load_weights(weights)
-    seen = [(look(network, embedder, query), look(network, embedder, match)) for query, match in pairs]
-    plot_superfeatures(folder / "superfeatures.png", seen, network.config.image_size)
-    plot_keypoints(folder / "keypoints.png", [query for query, _ in seen])
 
 
 def work(world: TestWorld) -> int:
