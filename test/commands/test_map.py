@@ -84,7 +84,7 @@ def test_a_map_that_was_cut_off_while_it_compared_goes_on(made: tuple[Path, Ende
 def wrong_calls(tmp_path: Path) -> Iterator[tuple[list[Path], str]]:
     (tmp_path / "empty").mkdir()
     yield [tmp_path / "missing.mcap"], "there is no recording"
-    yield [tmp_path / "empty"], "holds no recording"
+    yield [tmp_path / "empty"], "empty is not a recording"
     (tmp_path / "notes.txt").write_text("these are notes\n")
     yield [tmp_path / "notes.txt"], "notes.txt is not a recording"
     small = write_mcap(tmp_path / "small.mcap", traverse(0.3))

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, partial
+from importlib import import_module
 from io import BytesIO
 from itertools import chain, islice
 from pathlib import Path
@@ -360,8 +361,8 @@ def _open_folder(path: Path) -> list[RecordedFile]:
     """Open all files of a folder, or those of folders in it, whatever its metadata list: recorders are killed."""
     inside = [file for one in sorted(path.iterdir()) if one.is_dir() for file in _files_of(one)]
     paths = _in_number_order(_files_of(path) or inside)
-    if not paths:
-        raise BagError(f"{path} is not a recording: it holds neither mcap nor db3 files")
+    if not paths:  # files of a data set, which the lab reads; by name, as its commands are
+        return [import_module("umf_ros.lab.importing").open_data_set(path)]
     files = [RosbagsFile(one) if ".db3" in one.suffixes else McapFile(one) for one in paths]
     folders = dict.fromkeys(file.path.parent for file in files)
     if len(folders) > 1 and all(len({file.path.parent for file in group}) == 1 for group in _overlapping(files)):
@@ -516,7 +517,7 @@ def _size_of_objects(raw: RawMessage) -> int:
 
 
 def open_bag(path: str | Path) -> Bag:
-    """Open an mcap file, a ROS 2 folder (mcap or db3), a db3 file or a ROS 1 `.bag`.
+    """Open an mcap file, a ROS 2 folder (mcap or db3), a db3 file, a ROS 1 `.bag` or the folder of a data set.
 
     A truncated recording is opened up to its last readable message; `Bag.warning` is set.
 

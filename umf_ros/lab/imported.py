@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +13,27 @@ import numpy as np
 import yaml
 
 from umf_ros.bags.presets import GROUND_TRUTH_TOPIC
+from umf_ros.bags.reader import RawMessage, message_types
 from umf_ros.core.config import Topics
 from umf_ros.core.errors import OutputError
+from umf_ros.core.frames import StereoCamera
 from umf_ros.core.geometry import Array, make_pose, to_quaternion
 from umf_ros.core.io import write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.lab.scan_files import SensorFileError, read_image
-from umf_ros.lab.simulation.bag_writer import BagWriter, image_message, packed_cloud, pose_message
-from umf_ros.sensors.decode import Cloud
+from umf_ros.lab.simulation.bag_writer import (
+    BagWriter,
+    camera_info_message,
+    image_message,
+    packed_cloud,
+    pose_message,
+    transforms_message,
+)
+from umf_ros.sensors.decode import CLOUD, IMAGE, TYPES, Cloud
+from umf_ros.sensors.tf import TOPIC as TRANSFORMS
+from umf_ros.sensors.tf import TYPE as TRANSFORMS_TYPE
+
+POSE = "geometry_msgs/msg/PoseStamped"
 
 OPTICAL = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """`body_T_camera` where the camera is the body: x ahead, y left, z up."""
@@ -48,7 +63,8 @@ class Imported:
 
     def calibration(self) -> dict[str, Any]:
         """The content of a calibration file."""
-        poses = {"body_T_camera": self.body_T_camera, "body_T_lidar": self.body_T_lidar, "body_T_imu": np.eye(4)}
+        poses = {"body_T_lidar": self.body_T_lidar, "body_T_imu": np.eye(4)}
+        poses |= {"body_T_camera": self.body_T_camera} if self.left else {}
         told: dict[str, Any] = {**self.camera, **{name: pose_entry(pose) for name, pose in poses.items()}}
         return told | {"lidar_time_offset_s": 0.0, "min_intensity": 0.0, "max_height_m": 0.0}
 
@@ -74,8 +90,8 @@ _LAYOUT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4
 TOPICS = Topics(
     left_image="/camera/left/image",
     right_image="/camera/right/image",
-    left_info="",
-    right_info="",
+    left_info="/camera/left/camera_info",
+    right_info="/camera/right/camera_info",
     cloud="/lidar/points",
     odometry="",
 )
@@ -89,7 +105,32 @@ def check_absent(*paths: Path) -> None:
             raise OutputError(f"{path} is there already: nothing was written")
 
 
-Entry = tuple[int, str, Callable[[], Any]]
+Entry = tuple[int, str, str, Callable[[], Any]]
+"""Stamp in ns, topic and type of a message, and what makes it."""
+
+
+class DataSetFile:
+    """Files of a data set, read like one file of a recording: each message is made when it is asked for.
+
+    Attributes:
+        path: the folder.
+        types, counts: type and number of messages by topic.
+        start_ns, end_ns: stamps of the first and the last message.
+        warning: empty.
+    """
+
+    def __init__(self, path: Path, found: Imported) -> None:
+        self.path, self.warning = path, ""
+        self._entries = sorted(_entries(found), key=lambda entry: entry[:2])
+        self.types = {topic: kind for _, topic, kind, _ in self._entries}
+        self.counts = Counter(topic for _, topic, *_ in self._entries)
+        self.start_ns, self.end_ns = self._entries[0][0], self._entries[-1][0]
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Yield messages of some topics in the order of their stamps; an unreadable file raises a `SensorFileError`."""
+        for stamp_ns, topic, kind, make in self._entries:
+            if topic in topics:
+                yield RawMessage(topic, stamp_ns, kind, bytes(message_types().serialize_cdr(make(), kind)))
 
 
 def write_recording(found: Imported, out: Path, progress: Callable[[float], None] = lambda _: None) -> Path:
@@ -101,9 +142,9 @@ def write_recording(found: Imported, out: Path, progress: Callable[[float], None
     """
     calibration, config = out.with_suffix(".calibration.yaml"), out.with_suffix(".yaml")
     check_absent(out, calibration, config)
-    entries = sorted(_entries(found), key=lambda entry: entry[0])
+    entries = sorted(_entries(found), key=lambda entry: entry[:2])
     with BagWriter(out) as bag:
-        for number, (stamp, topic, make) in enumerate(entries, 1):
+        for number, (stamp, topic, _, make) in enumerate(entries, 1):
             bag.write(topic, make(), stamp)
             progress(number / len(entries))
     notes = "".join(f"# TO BE MEASURED: {what}\n" for what in found.guessed)
@@ -114,14 +155,40 @@ def write_recording(found: Imported, out: Path, progress: Callable[[float], None
 
 
 def _entries(found: Imported) -> Iterator[Entry]:
-    for topic, files in ((TOPICS.left_image, found.left), (TOPICS.right_image, found.right)):
+    """Messages of a data set; how the sensors are built and mounted only where that is known, of rectified images."""
+    cameras = {TOPICS.left_image: found.left, TOPICS.right_image: found.right}
+    for topic, files in cameras.items():
         for stamp, path in files:
-            yield stamp, topic, lambda stamp=stamp, path=path: image_message(read_image(path), stamp, "camera")  # type: ignore[misc]
+            yield stamp, topic, IMAGE, partial(_image, path, stamp)
     for stamp, read in found.scans:
-        yield stamp, TOPICS.cloud, lambda stamp=stamp, read=read: cloud_message(read(), stamp)  # type: ignore[misc]
+        yield stamp, TOPICS.cloud, CLOUD, partial(_cloud, read, stamp)
     if found.truth is not None:
         for stamp, pose in zip(found.truth.stamps_ns.tolist(), found.truth.poses, strict=True):
-            yield stamp, GROUND_TRUTH_TOPIC, lambda stamp=stamp, pose=pose: pose_message(pose, stamp, "map")  # type: ignore[misc]
+            yield stamp, GROUND_TRUTH_TOPIC, POSE, partial(pose_message, pose, stamp, "map")
+    if found.guessed or (found.left and "camera" not in found.camera):
+        return
+    first_ns = min(files[0][0] for files in (found.left, found.right, found.scans) if files)
+    mounted = {"camera": found.body_T_camera} if found.left else {}
+    mounted |= {"lidar": found.body_T_lidar} if found.scans else {}
+    yield first_ns, TRANSFORMS, TRANSFORMS_TYPE, partial(transforms_message, mounted, first_ns)
+    infos = TOPICS.left_info, TOPICS.right_info
+    for topic, files, right in zip(infos, cameras.values(), (False, True), strict=True):
+        if files:
+            camera = StereoCamera(**found.camera["camera"])
+            yield (
+                first_ns,
+                topic,
+                TYPES["left_info"][0],
+                partial(camera_info_message, camera, first_ns, "camera", right),
+            )
+
+
+def _image(path: Path, stamp_ns: int) -> Any:
+    return image_message(read_image(path), stamp_ns, "camera")
+
+
+def _cloud(read: Callable[[], Cloud], stamp_ns: int) -> Any:
+    return cloud_message(read(), stamp_ns)
 
 
 def cloud_message(cloud: Cloud, stamp_ns: int) -> Any:

@@ -1,4 +1,4 @@
-"""Formats of data sets: KITTI, EuRoC (ASL), TUM RGB-D, nuScenes, VSLAM-LAB, plain folders.
+"""Formats of data sets with cameras: KITTI, EuRoC (ASL), TUM RGB-D, nuScenes, VSLAM-LAB, plain folders.
 
 Every format is a function that returns an `Imported`; a new one is a row in `FORMATS`.
 """
@@ -17,10 +17,12 @@ import numpy as np
 
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core import limits
+from umf_ros.core.errors import BagError, command_line
 from umf_ros.core.geometry import Array, from_quaternion, invert
 from umf_ros.core.io import read_yaml
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.lab.imported import OPTICAL, Imported, pose_entry
+from umf_ros.lab import lidar_sets
+from umf_ros.lab.imported import OPTICAL, DataSetFile, Imported, pose_entry
 from umf_ros.lab.scan_files import IMAGE_SUFFIXES, SUFFIXES, SensorFileError, read_image, read_picture, read_scan
 from umf_ros.sensors.decode import Cloud
 
@@ -333,8 +335,43 @@ FORMATS: dict[str, Callable[[Path], Imported]] = {
     "tum-rgbd": tum_rgbd,
     "nuscenes": nuscenes,
     "vslam-lab": vslam_lab,
+    "mulran": lidar_sets.mulran,
+    "helipr": lidar_sets.helipr,
+    "nclt": lidar_sets.nclt,
+    "newer-college": lidar_sets.newer_college,
     "folder": folder,
 }
+MARKS = {
+    "kitti-odometry": ("calib.txt", "times.txt"),
+    "kitti-raw": ("velodyne_points/timestamps.txt",),
+    "euroc": ("**/cam0/sensor.yaml",),
+    "tum-rgbd": ("rgb.txt", "depth.txt"),
+    "nuscenes": ("v1.0-*",),
+    "vslam-lab": ("rgb.csv", "calibration.yaml"),
+    "mulran": ("**/Ouster", "global_pose.csv"),
+    "helipr": ("LiDAR/Ouster",),
+    "nclt": ("velodyne_sync",),
+    "newer-college": ("**/ouster_scan",),
+    "folder": ("times.txt",),
+}
+"""Files and folders that a format is recognised by, the more special formats first."""
+
+
+def open_data_set(source: Path) -> DataSetFile:
+    """Read the folder of a data set like a file of a recording.
+
+    Raises:
+        BagError: it is of no known format, or lacks what a replay needs to know of the sensors.
+        SensorFileError: a file cannot be read.
+    """
+    kind = next((kind for kind, marks in MARKS.items() if all(any(source.glob(one)) for one in marks)), "")
+    if not kind:
+        raise BagError(f"{source} is not a recording: it holds neither mcap nor db3 files, nor a known data set")
+    found = FORMATS[kind](source)
+    if found.guessed or "raw_camera" in found.camera:
+        command = command_line("import", kind, source, f"{source.name}.mcap")
+        raise BagError(f"{source} has files of {kind} and needs a calibration, which is written by {command}")
+    return DataSetFile(source, found)
 
 
 def _in_order(source: Path, stamps: list[int]) -> list[tuple[int, Path]]:

@@ -82,21 +82,35 @@ def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
     return cloud
 
 
+def read_records(path: Path, record: Record, unit_m: float = 1.0, origin_m: float = 0.0) -> Cloud:
+    """Read the real returns of a file of records with x, y and z, which count `unit_m` from `origin_m`.
+
+    Raises:
+        SensorFileError: the file cannot be read, or does not hold whole records.
+    """
+
+    def scaled(columns: Columns) -> Cloud:
+        metres = {axis: columns[axis] * np.float32(unit_m) + np.float32(origin_m) for axis in "xyz"}
+        return real_returns(columns | metres, columns)[0]
+
+    return _read(path, scaled, record)
+
+
 def read_points(path: Path) -> NDArray[np.float64]:
     """Read the points (N, 3) of the cloud of a map, however far they are; raises as `read_scan`."""
     points = _read(path, lambda columns: np.column_stack([np.asarray(columns[axis], float) for axis in "xyz"]))
     return points[np.isfinite(points).all(axis=1) & points.any(axis=1)]
 
 
-def _read(path: Path, take: Callable[[Columns], Taken], bin_columns: int = 0) -> Taken:
-    """Return what is taken from the columns of a file."""
+def _read(path: Path, take: Callable[[Columns], Taken], kind: int | Record = 0) -> Taken:
+    """Return what is taken from the columns of a file; `kind` is that of a .bin: its columns of float32, or records."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise SensorFileError(f"{path} is no scan: expected {either(SUFFIXES)}")
     try:
         check_size(path.stat().st_size, "it", LARGEST_SCAN)
         content = path.read_bytes()
-        columns = _parse_bin(content, bin_columns) if suffix == ".bin" else _PARSERS[suffix](content)
+        columns = _parse_bin(content, kind) if suffix == ".bin" else _PARSERS[suffix](content)
         missing = [axis for axis in "xyz" if axis not in columns]
         if missing:
             raise SensorFileError(f"no field {', '.join(missing)}")
@@ -354,7 +368,11 @@ def _parse_npy(content: bytes) -> Columns:
     return _by_name(array)
 
 
-def _parse_bin(content: bytes, columns: int) -> Columns:
+def _parse_bin(content: bytes, columns: int | Record) -> Columns:
+    if isinstance(columns, np.dtype):
+        if len(content) % columns.itemsize:
+            raise SensorFileError(f"{len(content)} bytes are no records of {columns.itemsize}")
+        return _unpack(content, columns, len(content) // columns.itemsize)
     if len(content) % 4:
         raise SensorFileError(f"{len(content)} bytes are no float32 numbers")
     numbers = np.frombuffer(content, "<f4")

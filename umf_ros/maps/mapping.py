@@ -97,15 +97,13 @@ class Opening:
 
 
 def find_recordings(paths: list[Path]) -> list[Path]:
-    """Return the recordings among files and folders, those of a folder sorted by name; each path must have one."""
+    """Return the recordings among files and folders, those of a folder sorted by name."""
     found = []
     for path in paths:
         if not path.exists():
             raise BagError(f"there is no recording {path}")
         inside = [path] if path.is_file() or _is_recording(path) else sorted(filter(_is_recording, path.iterdir()))
-        if not inside:
-            raise BagError(f"{path} holds no recording ({', '.join(RECORDINGS)}, or a folder with metadata.yaml)")
-        found += inside
+        found += inside or [path]  # the folder of a data set
     return list(dict.fromkeys(path.resolve() for path in found))
 
 

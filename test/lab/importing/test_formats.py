@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import yaml
 from command_line import only_line, umf
 
 from umf_ros.bags.frames import FrameReader
+from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import load_settings
@@ -23,15 +25,16 @@ from umf_ros.sensors.calibration import load_calibration
 
 SIZE = (64, 48)
 COUNT = 5
+SCANS_ALONE = ("mulran", "helipr", "nclt", "newer-college")
 START_S = 1_400_000_000
 PROJECTION = "50 0 32 {} 0 50 24 0 0 0 1 0"
 VELO_TO_CAMERA = "0 -1 0 0 0 0 -1 -0.1 1 0 0 -0.3"
 """`camera_T_velo`, three rows: a camera that looks ahead, 0.3 m before the LiDAR and 0.1 m below it."""
 
 
-def picture(path: Path, value: int) -> None:
+def picture(path: Path, value: int, size: tuple[int, int] = SIZE) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.full((SIZE[1], SIZE[0]), value, np.uint8))
+    cv2.imwrite(str(path), np.full(size[::-1], value, np.uint8))
 
 
 def scan(path: Path, number: int) -> np.ndarray:
@@ -103,9 +106,9 @@ def tum_rgbd(root: Path) -> Path:
     rgb, depth, truth = [], [], []
     for i in range(COUNT):
         seconds = f"{START_S + 0.1 * i:.4f}"
-        picture(root / "rgb" / f"{i}.png", 20 * i)
+        picture(root / "rgb" / f"{i}.png", 20 * i, (640, 480))
         (root / "depth").mkdir(exist_ok=True)
-        cv2.imwrite(str(root / "depth" / f"{i}.png"), np.full((48, 64), 10_000, np.uint16))  # 2 m ahead
+        cv2.imwrite(str(root / "depth" / f"{i}.png"), np.full((480, 640), 10_000, np.uint16))  # 2 m ahead
         rgb.append(f"{seconds} rgb/{i}.png")
         depth.append(f"{seconds} depth/{i}.png")
         truth.append(f"{seconds} {i} 0 0 0 0 0 1")
@@ -154,7 +157,57 @@ def folder(root: Path) -> Path:
     return root
 
 
+def mulran(root: Path) -> Path:
+    rows = []
+    for i in range(COUNT):
+        stamp = START_S * 10**9 + i * 10**8
+        scan(root / "sensor_data" / "Ouster" / f"{stamp}.bin", i)
+        rows.append(f"{stamp},1,0,0,{300000 + i},0,1,0,4000000,0,0,1,20")
+    (root / "global_pose.csv").write_text("\n".join(rows))
+    return root
+
+
+def helipr(root: Path) -> Path:
+    (root / "LiDAR" / "Ouster").mkdir(parents=True)
+    (root / "LiDAR_GT").mkdir()
+    for i in range(COUNT):
+        stamp = START_S * 10**9 + i * 10**8
+        numbers = np.random.default_rng(i).uniform((2, -5, -1, 0), (20, 5, 1, 1), (200, 4))
+        rows = [struct.pack("<ffffIHHH", *row, 9, 8, 7, 6) for row in numbers]
+        (root / "LiDAR" / "Ouster" / f"{stamp}.bin").write_bytes(b"".join(rows))
+        with (root / "LiDAR_GT" / "Ouster_gt.txt").open("a") as file:
+            file.write(f"{stamp} {i} 0 0 0 0 0 1\n")
+    return root
+
+
+def nclt(root: Path) -> Path:
+    (root / "velodyne_sync").mkdir(parents=True)
+    truth = []
+    for i in range(COUNT):
+        micros = START_S * 10**6 + i * 100_000
+        numbers = np.random.default_rng(i).uniform((2, -5, -1), (20, 5, 1), (200, 3))
+        rows = [struct.pack("<HHHBB", *np.rint((row + 100) / 0.005).astype(int), 50, 3) for row in numbers]
+        (root / "velodyne_sync" / f"{micros}.bin").write_bytes(b"".join(rows))
+        truth.append(f"{micros}, {i}, 2, -3, 0, 0, {np.pi / 2}")
+    (root / "groundtruth_2012-01-08.csv").write_text("\n".join([*truth, f"{micros + 1}, NaN, NaN, NaN, NaN, NaN, NaN"]))
+    return root
+
+
+def newer_college(root: Path) -> Path:
+    folder = root / "raw_format" / "ouster_scan"
+    folder.mkdir(parents=True)
+    for i in range(COUNT):
+        points = np.random.default_rng(i).uniform((2, -5, -1), (20, 5, 1), (200, 3)).astype("<f4")
+        header = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 200\nHEIGHT 1\nPOINTS 200\nDATA binary\n"
+        (folder / f"cloud_{START_S}_{i * 10**8:09d}.pcd").write_bytes(header.encode() + points.tobytes())
+    return root
+
+
 MADE: dict[str, Callable[[Path], Path]] = {
+    "mulran": mulran,
+    "helipr": helipr,
+    "nclt": nclt,
+    "newer-college": newer_college,
     "kitti-odometry": kitti_odometry,
     "kitti-raw": kitti_raw,
     "euroc": euroc,
@@ -174,7 +227,7 @@ def imported(kind: str, tmp_path: Path) -> list[Frame]:
         FrameReader(open_bag(tmp_path / "made.mcap"), load_settings(tmp_path / "made.yaml"), warn=told.append)
     )
     # only bare folders come without a calibration
-    assert ["holds guesses" in warning for warning in told] == [True] * (kind == "folder")
+    assert ["holds guesses" in warning for warning in told] == [True] * (kind == "folder"), told
     return frames
 
 
@@ -182,12 +235,65 @@ def imported(kind: str, tmp_path: Path) -> list[Frame]:
 def test_every_format_becomes_frames(kind: str, tmp_path: Path) -> None:
     frames = imported(kind, tmp_path)
     assert len(frames) == COUNT
-    assert [frame.left is not None for frame in frames] == [True] * COUNT
+    assert all((frame.left is not None) == (kind not in SCANS_ALONE) for frame in frames)
     assert all((frame.points is not None) == (kind != "euroc") for frame in frames)
-    assert all((frame.right is not None) == (kind not in ("tum-rgbd", "nuscenes")) for frame in frames)
+    assert all((frame.right is not None) == (kind not in ("tum-rgbd", "nuscenes", *SCANS_ALONE)) for frame in frames)
     assert np.allclose(np.diff([frame.stamp_ns for frame in frames]), 50_000_000 if kind == "euroc" else 10**8)
     inspected = umf("inspect", tmp_path / "made.mcap")
     assert "no match is allowed" in inspected.text and inspected.text.count("fault") == 1  # half a second is too short
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_a_folder_is_read_as_what_is_imported_of_it(kind: str, tmp_path: Path) -> None:
+    frames, source = imported(kind, tmp_path), MADE[kind](tmp_path / "again")
+    if kind in ("euroc", "folder"):
+        command = f"umf import {kind} {source} {source.name}.mcap"
+        assert only_line(umf("replay", source)) == (
+            f"{source} has files of {kind} and needs a calibration, which is written by {command}"
+        )
+        return
+    bag = open_bag(source)
+    read = list(FrameReader(bag, settings_for(bag, None, "auto")))
+    assert [frame.stamp_ns for frame in read] == [frame.stamp_ns for frame in frames]
+    for one, other in zip(read, frames, strict=True):
+        np.testing.assert_allclose(one.points, other.points, atol=1e-5)
+        np.testing.assert_allclose(one.body_T_lidar, other.body_T_lidar, atol=1e-9)
+        assert (one.left is None) == (other.left is None) and (one.left is None or (one.left == other.left).all())
+        if one.left is not None:
+            assert one.camera == other.camera
+            np.testing.assert_allclose(one.body_T_camera, other.body_T_camera, atol=1e-9)
+    truth, same = read_ground_truth(bag), read_ground_truth(open_bag(tmp_path / "made.mcap"))
+    assert (truth is None) == (same is None) == (kind in ("kitti-raw", "newer-college"))
+    if truth is not None and same is not None:
+        np.testing.assert_allclose(truth.poses, same.poses, atol=1e-9)
+
+
+def test_ncl_ts_axes_point_up(tmp_path: Path) -> None:
+    """Its car drives north, and its body and scanner are seen upside down."""
+    imported("nclt", tmp_path)
+    truth = read_ground_truth(open_bag(tmp_path / "made.mcap"))
+    assert truth is not None and len(truth) == COUNT
+    np.testing.assert_allclose(truth.poses[1, :3, 3], [1, -2, 3], atol=1e-9)
+    np.testing.assert_allclose(truth.poses[1, :3, 0], [0, -1, 0], atol=1e-9)  # heading east: to the right of north
+    np.testing.assert_allclose(truth.poses[1, :3, 2], [0, 0, 1], atol=1e-9)
+    assert load_calibration(str(tmp_path / "made.calibration.yaml")).body_T_lidar[2, 2] < -0.99
+
+
+@pytest.mark.parametrize(
+    ("kind", "file", "content", "message"),
+    [
+        ("mulran", "global_pose.csv", "1,2,3\n", "expected lines of a stamp and 12 numbers"),
+        ("mulran", "sensor_data/Ouster/first.bin", "", "names of scans are no stamps"),
+        ("helipr", "LiDAR_GT/Ouster_gt.txt", "1 2\n", "Ouster_gt.txt, line 1: expected 8 numbers"),
+        ("helipr", f"LiDAR/Ouster/{START_S}000000000.bin", "12345", "5 bytes are no records of 26"),
+        ("nclt", "groundtruth_2012-01-08.csv", "a,b,c,d,e,f,g\n", "cannot read"),
+        ("newer-college", "raw_format/ouster_scan/cloud_1.pcd", "", "names of scans are no stamps"),
+    ],
+)
+def test_a_malformed_folder_is_one_clear_line(kind: str, file: str, content: str, message: str, tmp_path: Path) -> None:
+    source = MADE[kind](tmp_path / "set")
+    (source / file).write_text(content)
+    assert message in only_line(umf("inspect", source))
 
 
 def test_kittis_camera_looks_ahead_from_its_lidar_and_drives_that_way(tmp_path: Path) -> None:
@@ -205,7 +311,7 @@ def test_depth_images_are_scans_ahead_of_the_camera(tmp_path: Path) -> None:
     frame = imported("tum-rgbd", tmp_path)[2]
     assert frame.points is not None
     np.testing.assert_allclose(frame.points[:, 0], 2.0, atol=1e-5)
-    assert len(frame.points) == 16 * 12
+    assert len(frame.points) == 160 * 120
 
 
 def test_nuscenes_is_seen_from_its_ego_frame(tmp_path: Path) -> None:

@@ -9,7 +9,10 @@ import typer
 
 from umf_ros.core.errors import BagError, ConfigError, OutputError, either
 
-KINDS = ("kitti-odometry", "kitti-raw", "euroc", "tum-rgbd", "nuscenes", "vslam-lab", "folder")
+KINDS = (
+    *("kitti-odometry", "kitti-raw", "euroc", "tum-rgbd", "nuscenes", "vslam-lab"),
+    *("mulran", "helipr", "nclt", "newer-college", "folder"),
+)
 
 
 def command(
@@ -17,9 +20,9 @@ def command(
     source: Annotated[Path, typer.Argument(help="Folder of the sequence.")],
     out: Annotated[Path, typer.Argument(help="The .mcap file to write, with .yaml and .calibration.yaml beside it.")],
 ) -> None:
-    """Make a recording of KITTI, EuRoC (ASL), TUM RGB-D, nuScenes, VSLAM-LAB, or images and scans with a times.txt.
+    """Make a recording of a data set: KITTI, EuRoC (ASL), TUM RGB-D, nuScenes, MulRan, HeLiPR, NCLT and others.
 
-    They have no odometry: run one, and pass its poses to umf replay with --odometry.
+    A folder of images and scans needs a times.txt. umf replay reads most of these folders without an import.
     """
     if kind not in KINDS:
         raise ConfigError(f"unknown kind {kind!r}; expected {either(KINDS)}")

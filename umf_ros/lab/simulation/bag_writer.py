@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import count
 from pathlib import Path
 from types import TracebackType
@@ -169,6 +169,17 @@ def odometry_message(pose: Array, twist: Array, deviations: Array, stamp_ns: int
 def pose_message(pose: Array, stamp_ns: int, frame: str) -> Any:
     """geometry_msgs/PoseStamped."""
     return _new("geometry_msgs/msg/PoseStamped", header=_header(stamp_ns, frame), pose=_pose(pose))
+
+
+def transforms_message(mounted: Mapping[str, Array], stamp_ns: int) -> Any:
+    """tf2_msgs/TFMessage of the poses (4, 4) of frames on `base_link`."""
+    found = []
+    for name, pose in mounted.items():
+        shift, turn = _vector(pose[:3, 3]), _pose(pose).orientation
+        moved = _new("geometry_msgs/msg/Transform", translation=shift, rotation=turn)
+        header = _header(stamp_ns, "base_link")
+        found.append(_new("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=name, transform=moved))
+    return _new("tf2_msgs/msg/TFMessage", transforms=found)
 
 
 def fix_message(geodetic: Array, deviation_m: float, stamp_ns: int) -> Any:
