@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from umf_ros.core.config import Parameters, ParameterSource, Settings
     from umf_ros.core.trajectory import Trajectory
 
-BagPath = Annotated[Path, typer.Argument(help="mcap file, db3 folder, or ROS 1 .bag.")]
+BagPath = Annotated[Path, typer.Argument(help="mcap file, db3 folder, ROS 1 .bag, or folder of a data set.")]
 ConfigPath = Annotated[Path | None, typer.Option("--config", help="Parameter file (YAML).")]
 Changes = Annotated[
     list[str] | None,

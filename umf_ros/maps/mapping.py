@@ -102,8 +102,8 @@ def find_recordings(paths: list[Path]) -> list[Path]:
     for path in paths:
         if not path.exists():
             raise BagError(f"there is no recording {path}")
-        inside = [path] if path.is_file() or _is_recording(path) else sorted(filter(_is_recording, path.iterdir()))
-        found += inside or [path]  # the folder of a data set
+        # else one of a data set, or none
+        found += sorted(filter(_is_recording, [path] if path.is_file() else [path, *path.iterdir()])) or [path]
     return list(dict.fromkeys(path.resolve() for path in found))
 
 

@@ -27,6 +27,8 @@ SIZE = (64, 48)
 COUNT = 5
 SCANS_ALONE = ("mulran", "helipr", "nclt", "newer-college")
 START_S = 1_400_000_000
+STAMPS = [START_S * 10**9 + i * 10**8 for i in range(COUNT)]
+POINTS = np.random.default_rng(0).uniform((2, -5, -1), (20, 5, 1), (200, 3)).astype("<f4")
 PROJECTION = "50 0 32 {} 0 50 24 0 0 0 1 0"
 VELO_TO_CAMERA = "0 -1 0 0 0 0 -1 -0.1 1 0 0 -0.3"
 """`camera_T_velo`, three rows: a camera that looks ahead, 0.3 m before the LiDAR and 0.1 m below it."""
@@ -158,48 +160,40 @@ def folder(root: Path) -> Path:
 
 
 def mulran(root: Path) -> Path:
-    rows = []
-    for i in range(COUNT):
-        stamp = START_S * 10**9 + i * 10**8
+    for i, stamp in enumerate(STAMPS):
         scan(root / "sensor_data" / "Ouster" / f"{stamp}.bin", i)
-        rows.append(f"{stamp},1,0,0,{300000 + i},0,1,0,4000000,0,0,1,20")
+    rows = [f"{stamp},1,0,0,{300000 + i},0,1,0,4000000,0,0,1,20" for i, stamp in enumerate(STAMPS)]
     (root / "global_pose.csv").write_text("\n".join(rows))
     return root
 
 
 def helipr(root: Path) -> Path:
-    (root / "LiDAR" / "Ouster").mkdir(parents=True)
-    (root / "LiDAR_GT").mkdir()
-    for i in range(COUNT):
-        stamp = START_S * 10**9 + i * 10**8
-        numbers = np.random.default_rng(i).uniform((2, -5, -1, 0), (20, 5, 1, 1), (200, 4))
-        rows = [struct.pack("<ffffIHHH", *row, 9, 8, 7, 6) for row in numbers]
+    for name in ("LiDAR/Ouster", "LiDAR_GT"):
+        (root / name).mkdir(parents=True)
+    for stamp in STAMPS:
+        rows = [struct.pack("<ffffIHHH", x, y, z, 0.5, 9, 8, 7, 6) for x, y, z in POINTS]
         (root / "LiDAR" / "Ouster" / f"{stamp}.bin").write_bytes(b"".join(rows))
-        with (root / "LiDAR_GT" / "Ouster_gt.txt").open("a") as file:
-            file.write(f"{stamp} {i} 0 0 0 0 0 1\n")
+    rows = [f"{stamp} {i} 0 0 0 0 0 1\n" for i, stamp in enumerate(STAMPS)]
+    (root / "LiDAR_GT" / "Ouster_gt.txt").write_text("".join(rows))
     return root
 
 
 def nclt(root: Path) -> Path:
     (root / "velodyne_sync").mkdir(parents=True)
-    truth = []
-    for i in range(COUNT):
-        micros = START_S * 10**6 + i * 100_000
-        numbers = np.random.default_rng(i).uniform((2, -5, -1), (20, 5, 1), (200, 3))
-        rows = [struct.pack("<HHHBB", *np.rint((row + 100) / 0.005).astype(int), 50, 3) for row in numbers]
-        (root / "velodyne_sync" / f"{micros}.bin").write_bytes(b"".join(rows))
-        truth.append(f"{micros}, {i}, 2, -3, 0, 0, {np.pi / 2}")
-    (root / "groundtruth_2012-01-08.csv").write_text("\n".join([*truth, f"{micros + 1}, NaN, NaN, NaN, NaN, NaN, NaN"]))
+    for stamp in STAMPS:
+        rows = [struct.pack("<HHHBB", *np.rint((row + 100) / 0.005).astype(int), 50, 3) for row in POINTS]
+        (root / "velodyne_sync" / f"{stamp // 1000}.bin").write_bytes(b"".join(rows))
+    truth = [f"{stamp // 1000}, {i}, 2, -3, 0, 0, {np.pi / 2}" for i, stamp in enumerate(STAMPS)]
+    (root / "groundtruth_2012-01-08.csv").write_text("\n".join([*truth, "9, NaN, NaN, NaN, NaN, NaN, NaN"]))
     return root
 
 
 def newer_college(root: Path) -> Path:
-    folder = root / "raw_format" / "ouster_scan"
-    folder.mkdir(parents=True)
-    for i in range(COUNT):
-        points = np.random.default_rng(i).uniform((2, -5, -1), (20, 5, 1), (200, 3)).astype("<f4")
-        header = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 200\nHEIGHT 1\nPOINTS 200\nDATA binary\n"
-        (folder / f"cloud_{START_S}_{i * 10**8:09d}.pcd").write_bytes(header.encode() + points.tobytes())
+    (root / "raw_format" / "ouster_scan").mkdir(parents=True)
+    header = b"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 200\nHEIGHT 1\nPOINTS 200\nDATA binary\n"
+    for stamp in STAMPS:
+        name = f"cloud_{stamp // 10**9}_{stamp % 10**9:09d}.pcd"
+        (root / "raw_format" / "ouster_scan" / name).write_bytes(header + POINTS.tobytes())
     return root
 
 
@@ -264,11 +258,10 @@ def test_a_folder_is_read_as_what_is_imported_of_it(kind: str, tmp_path: Path) -
             np.testing.assert_allclose(one.body_T_camera, other.body_T_camera, atol=1e-9)
     truth, same = read_ground_truth(bag), read_ground_truth(open_bag(tmp_path / "made.mcap"))
     assert (truth is None) == (same is None) == (kind in ("kitti-raw", "newer-college"))
-    if truth is not None and same is not None:
-        np.testing.assert_allclose(truth.poses, same.poses, atol=1e-9)
+    assert truth is None or np.allclose(truth.poses, same.poses, atol=1e-9)
 
 
-def test_ncl_ts_axes_point_up(tmp_path: Path) -> None:
+def test_the_axes_of_nclt_point_up(tmp_path: Path) -> None:
     """Its car drives north, and its body and scanner are seen upside down."""
     imported("nclt", tmp_path)
     truth = read_ground_truth(open_bag(tmp_path / "made.mcap"))
