@@ -192,7 +192,7 @@ PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float
         ("a.bin", b"123", "3 bytes"),
         ("a.bin", b"1234" * 7, "--bin-columns"),
         ("a.bin", b"", "holds no return"),
-        ("a.las", b"LASF", "expected .pcd, .ply, .npy or .bin"),
+        ("a.xyz", b"1 2 3", "expected .pcd, .ply, .npy, .las, .laz or .bin"),
     ],
 )
 def test_what_is_no_scan_is_named_on_one_line(

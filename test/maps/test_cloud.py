@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 from command_line import umf
@@ -156,7 +157,14 @@ def test_a_trajectory_in_another_frame_and_a_folder_with_files_are_refused(tmp_p
 
 def test_clouds_that_are_none_are_one_line(tmp_path: Path) -> None:
     good = write_cloud(tmp_path / "good.pcd", np.eye(3).repeat(100, axis=0) * np.linspace(1, 30, 300)[:, None])
-    assert len(thinned(read_points(good), good)) > 200
+    points = read_points(good)
+    assert len(thinned(points, good)) > 200
+    for suffix in ("las", "laz"):  # of a survey, far from the origin
+        survey = laspy.create()
+        survey.header.scales, survey.header.offsets = np.full(3, 1e-3), np.array([5e5, 4e6, 0.0])
+        survey.xyz = points + survey.header.offsets
+        survey.write(tmp_path / f"good.{suffix}")
+        np.testing.assert_allclose(read_points(tmp_path / f"good.{suffix}"), survey.xyz, atol=1e-3)
     wrong = {"cut.pcd": good.read_bytes()[:-50], "none.ply": b"ply\n", "few.ply": b"", "cloud.las": b"LASF"}
     for name, damaged in wrong.items():
         (tmp_path / name).write_bytes(damaged)

@@ -1,4 +1,4 @@
-"""Read scans (.pcd, .ply, .npy, .bin) and images from files as frames."""
+"""Read scans (.pcd, .ply, .las, .npy, .bin) and images from files as frames."""
 
 from __future__ import annotations
 
@@ -68,9 +68,9 @@ _MOST_NEGATIVE = 0.01
 def read_scan(path: Path, bin_columns: int = 0) -> Cloud:
     """Read the real returns of one scan, in the frame of the file.
 
-    Files are .pcd (ascii, binary, binary_compressed), .ply (ascii, binary), or .npy and .bin of (N, 3) or (N, 4)
-    numbers, x y z in metres and intensity; further columns are ignored. A .bin holds float32 with `bin_columns` numbers
-    per point; 0: 4 as in KITTI, 5 as in nuScenes or 3, the first that fits the size and has no negative intensities.
+    Files are .pcd, .ply, .las and .laz, or .npy and .bin of (N, 3) or (N, 4) numbers, x y z in metres and intensity;
+    further columns are ignored. A .bin holds float32 with `bin_columns` numbers per point; 0: 4 as in KITTI, 5 as in
+    nuScenes or 3, the first that fits the size and has no negative intensities.
 
     Raises:
         SensorFileError: the file cannot be read, is none of these, or holds no return; names it.
@@ -389,7 +389,18 @@ def _by_name(array: NDArray) -> Columns:
     return dict(zip(("x", "y", "z", "intensity"), array.T[:4], strict=False))
 
 
+def _parse_las(content: bytes) -> Columns:
+    """Also of LAZ."""
+    try:
+        import laspy
+    except ModuleNotFoundError:
+        raise SensorFileError("a .las or .laz needs another package: pip install 'umf_ros[las]'") from None
+    found = laspy.read(io.BytesIO(content))
+    return {name: np.asarray(found[name], float) for name in ("x", "y", "z", "intensity")}
+
+
 _PARSERS: dict[str, Callable[[bytes], Columns]] = {".pcd": parse_pcd, ".ply": parse_ply, ".npy": _parse_npy}
+_PARSERS |= dict.fromkeys((".las", ".laz"), _parse_las)
 SUFFIXES = (*_PARSERS, ".bin")
 
 

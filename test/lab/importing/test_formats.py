@@ -197,18 +197,8 @@ def newer_college(root: Path) -> Path:
     return root
 
 
-MADE: dict[str, Callable[[Path], Path]] = {
-    "mulran": mulran,
-    "helipr": helipr,
-    "nclt": nclt,
-    "newer-college": newer_college,
-    "kitti-odometry": kitti_odometry,
-    "kitti-raw": kitti_raw,
-    "euroc": euroc,
-    "tum-rgbd": tum_rgbd,
-    "nuscenes": nuscenes,
-    "folder": folder,
-}
+SETS = kitti_odometry, kitti_raw, euroc, tum_rgbd, nuscenes, mulran, helipr, nclt, newer_college, folder
+MADE: dict[str, Callable[[Path], Path]] = {make.__name__.replace("_", "-"): make for make in SETS}
 
 
 def imported(kind: str, tmp_path: Path) -> list[Frame]:

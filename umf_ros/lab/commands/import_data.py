@@ -9,10 +9,7 @@ import typer
 
 from umf_ros.core.errors import BagError, ConfigError, OutputError, either
 
-KINDS = (
-    *("kitti-odometry", "kitti-raw", "euroc", "tum-rgbd", "nuscenes", "vslam-lab"),
-    *("mulran", "helipr", "nclt", "newer-college", "folder"),
-)
+KINDS = "kitti-odometry kitti-raw euroc tum-rgbd nuscenes vslam-lab mulran helipr nclt newer-college folder".split()
 
 
 def command(

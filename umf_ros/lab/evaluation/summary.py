@@ -77,7 +77,7 @@ class WorldResult:
         yaw: recall@1 by difference of heading, opposite direction included.
         by_candidates: (K,) recall@1 by number of reranked candidates, by reranker.
         milliseconds: of the rerankers per query.
-        examples: frames of queries and of their best match after RANSAC.
+        examples: some frames, to take times.
     """
 
     name: str
@@ -86,7 +86,7 @@ class WorldResult:
     yaw: list[YawBin]
     by_candidates: dict[str, Array]
     milliseconds: dict[str, float]
-    examples: list[tuple[Frame, Frame]] = field(default_factory=list)
+    examples: list[Frame] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import WORDS_WEIGHT, Frame, ScanMotion
-from umf_ros.core.geometry import Array
+from umf_ros.core.geometry import Array, evenly
 from umf_ros.embedding import Embedder, make_embedder
 from umf_ros.lab.evaluation.results import (
     EvaluationReport,
@@ -180,9 +180,6 @@ ASKED = {
     "words": ("image", "image", 0.0, 1.0),
     "fused, words": ("fused", "fused", 1.0, WORDS_WEIGHT),
 }
-SHOWN = 3
-"""Queries whose frames are kept, to take times."""
-
 RERANKED = ("fused", "superfeatures both", "ransac both")
 TIMED_FRAMES = 8
 PICTURES = {
@@ -233,7 +230,7 @@ class WorldEvaluation:
             yaw=self._recall_by_yaw(),
             by_candidates={name: reranking.recall1_by_candidates(f"{name} both", task.positive) for name in RERANKERS},
             milliseconds=reranking.milliseconds,
-            examples=self._examples(task, reranking.after("ransac both")),
+            examples=[self._frames[row] for row in evenly(len(self._frames), TIMED_FRAMES)],
         )
 
     def _remember(self, visit: Visit) -> None:
@@ -274,13 +271,6 @@ class WorldEvaluation:
     def _recall_by_yaw(self) -> list[YawBin]:
         return recall_by_yaw(*self._ranked((REVISIT, OPPOSITE)))
 
-    def _examples(self, task: RetrievalTask, ranking: Ranking) -> list[tuple[Frame, Frame]]:
-        found = np.flatnonzero(ranking.hits(task.positive)[:, 0])
-        chosen = found[np.linspace(0, len(found) - 1, min(SHOWN, len(found))).astype(int)]
-        return [
-            (self._frames[task.queries[row]], self._frames[task.references[ranking.order[row, 0]]]) for row in chosen
-        ]
-
 
 class WorldsRun:
     """Evaluates one network on some worlds and fills a results folder.
@@ -312,8 +302,7 @@ class WorldsRun:
             evaluation = WorldEvaluation(world, self._embedder, self._settings, lambda: self._report(world.name, 1))  # noqa: B023
             results.append(evaluation.run())
         self._report("taking times", 0)
-        seen = [frame for result in results for pair in result.examples for frame in pair]
-        frames = [at_full_size(frame) for frame in seen[:TIMED_FRAMES]]
+        frames = [at_full_size(frame) for frame in results[0].examples]
         return WorldsSummary(results, cost_of_weights(self._weights, frames, self._repeats))
 
     def write(self, summary: WorldsSummary, folder: Path, notes: list[str]) -> EvaluationReport:
