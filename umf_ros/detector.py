@@ -463,8 +463,7 @@ def make_detector_embedder(settings: Settings) -> Embedder:
         ConfigError: unknown method, runtime or device.
         WeightsError: the weights cannot be used.
     """
-    chosen = settings.verification
-    return make_embedder(settings.embedding, chosen.rerank == "superfeatures", chosen.features)
+    return make_embedder(settings.embedding, features=settings.verification.features)
 
 
 @contextmanager

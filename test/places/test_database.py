@@ -27,7 +27,7 @@ def assert_same(a: Keyframe, b: Keyframe) -> None:
     np.testing.assert_array_equal(a.points, b.points)
     np.testing.assert_array_equal(a.path_length_m, b.path_length_m)
     assert (a.odom_T_body is None) == (b.odom_T_body is None)
-    for name in ("image", "cloud", "super_image", "super_cloud"):
+    for name in ("image", "cloud"):
         left, right = getattr(a.embedding, name), getattr(b.embedding, name)
         assert (left is None) == (right is None)
         for item in fields(left) if left is not None else ():

@@ -21,7 +21,7 @@ GROUND = landscape(20)
 HERE, THERE = pose_at(GROUND, -14.0, 1.2, 6.0, 2.0), pose_at(GROUND, -15.0, 0.0, 0.0)
 QUERY, MATCH = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
 OTHER = take(landscape(99), pose_at(landscape(99), -15.0, 0.0, 0.0), 20.0)
-CANDIDATE = ("similarity", "inliers_image", "inliers_cloud", "superfeatures")
+CANDIDATE = ("similarity", "inliers_image", "inliers_cloud")
 
 
 def most_probable(query: Keyframe, match: Keyframe) -> Hypothesis:

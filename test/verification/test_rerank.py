@@ -8,10 +8,10 @@ import pytest
 from umf_ros.core.config import Verification, load_settings
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import Candidate, Keyframe, SuperFeatures
+from umf_ros.lab.evaluation.retrieval import count_superfeatures, eligible_superfeatures
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan
 from umf_ros.verification.rerank import (
     Offered,
-    eligible_superfeatures,
     likelihoods,
     log_ratio,
     mutual_neighbours,
@@ -142,10 +142,12 @@ def test_superfeatures_are_counted_by_modality(modalities: str, expected: int) -
     image, cloud = rng.standard_normal((8, 32)), rng.standard_normal((5, 32))
     query, same = with_supers(QUERY, image, cloud), with_supers(SAME, image + 0.05, cloud - 0.05)
     shuffled = with_supers(elsewhere(0), image[::-1], np.roll(cloud, 2, axis=0))
-    settings = Verification(rerank="superfeatures", modalities=modalities)
-    best, worst = rerank(query, offered(shuffled, same), settings)
+    settings = Verification(modalities=modalities)
+    best, worst = rerank(query, offered(shuffled, same), settings, count_superfeatures)
     assert best[1] is same
-    assert (best[0].superfeatures, worst[0].superfeatures) == (expected, 0)
+    counts = count_superfeatures(query, same, settings)
+    parts = {"image": ["super_image"], "cloud": ["super_cloud"], "both": ["super_image", "super_cloud"]}[modalities]
+    assert sum(counts[part] or 0 for part in parts) == expected and best[0].score > worst[0].score
 
 
 def test_no_candidates_no_ranking() -> None:

@@ -143,13 +143,6 @@ def test_threshold_is_the_one_knob() -> None:
     assert Verifier(Verification(min_probability=0.5)).verify(query, [candidate(match)])[0].closure is not None
 
 
-def test_superfeatures_can_rerank_instead(verifier: Verifier) -> None:
-    chosen = Verifier(Verification(rerank="superfeatures", min_probability=LEAST))
-    found = chosen.verify(take(GROUND, HERE, 100.0), [candidate(take(GROUND, THERE, 10.0))])[0]
-    assert found.measurements["superfeatures"] == 0 and found.measurements["inliers_image"] == 0
-    assert gap(found)[0] < 0.05
-
-
 @pytest.mark.parametrize("modalities", ["image", "cloud"])
 def test_one_modality_can_rerank_alone(modalities: str) -> None:
     chosen = Verifier(Verification(modalities=modalities, min_probability=LEAST))

@@ -143,9 +143,6 @@ class Verification(Group):
 
     min_probability: float = Field(0.9, ge=0, le=1, description="least probability of a published closure")
     seed: int = Field(0, ge=0, description="seed of every RANSAC")
-    rerank: Literal["ransac", "superfeatures"] = Field(
-        "ransac", description="method that reranks candidates by local features"
-    )
     features: Literal["umf", "xfeat"] = Field(
         "xfeat", description="local features of images: XFeat's, or those of the embedding network"
     )

@@ -207,7 +207,6 @@ class Candidate:
         words: similarity by the words of the database; 0 where it was not compared.
         inliers_image: pairs of image features that one homography explains; NaN before the reranking.
         inliers_cloud: pairs of the scan's features that one rigid motion explains; NaN before the reranking.
-        superfeatures: eligible pairs of super-features of both modalities; NaN before the reranking.
         score: of the reranking, larger is better.
     """
 
@@ -216,7 +215,6 @@ class Candidate:
     similarity: float
     inliers_image: float = math.nan
     inliers_cloud: float = math.nan
-    superfeatures: float = math.nan
     score: float = 0.0
     words: float = 0.0
 

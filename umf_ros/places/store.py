@@ -19,7 +19,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from umf_ros.core.errors import UmfError
-from umf_ros.core.frames import Embedding, Keyframe, LocalFeatures, ScanMotion, StereoCamera, SuperFeatures
+from umf_ros.core.frames import Embedding, Keyframe, LocalFeatures, ScanMotion, StereoCamera
 from umf_ros.core.io import Schema, SqliteFile
 from umf_ros.core.limits import LARGEST_TEXT, check_size
 from umf_ros.places.words import WORDS, Code, Words
@@ -57,12 +57,7 @@ OUTBOX = Schema(
 )
 LARGEST_NUMBER = 2**53
 MOTION = "motion"
-FEATURES: dict[str, type[LocalFeatures] | type[SuperFeatures]] = {
-    "image": LocalFeatures,
-    "cloud": LocalFeatures,
-    "super_image": SuperFeatures,
-    "super_cloud": SuperFeatures,
-}
+FEATURES = ("image", "cloud")
 _SHAPES = {"descriptor": (), "points": (3,), "body_T_camera": (4, 4), "body_T_lidar": (4, 4), "odom_T_body": (4, 4)}
 """Last dimensions of the geometric arrays."""
 _KEYS = np.dtype([("id", np.int64), ("stamp_ns", np.int64), ("session", np.int64), ("travelled_m", np.float64)])
@@ -310,7 +305,7 @@ def unpack(blob: bytes) -> Keyframe:
             raise ValueError(f"{name} has a wrong shape or is not finite")
     stamp_ns, session = (int(number) for number in arrays["stamp_session"])
     width, height, *rest = (float(number) for number in arrays["camera"])
-    features = {group: _group(arrays, group, kind) for group, kind in FEATURES.items()}
+    features = {group: _group(arrays, group, LocalFeatures) for group in FEATURES}
     return Keyframe(
         stamp_ns=stamp_ns,
         embedding=Embedding(arrays["descriptor"], **features, scene=arrays.get("scene")),

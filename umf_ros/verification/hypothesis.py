@@ -133,7 +133,7 @@ def same_pose(a: Array, b: Array) -> bool:
 
 def measurements_of(candidate: Candidate) -> dict[str, float]:
     """Return the measurements of a candidate, which no pose changes."""
-    names = ("similarity", "inliers_image", "inliers_cloud", "superfeatures")
+    names = ("similarity", "inliers_image", "inliers_cloud")
     return known_only({name: float(getattr(candidate, name)) for name in names})
 
 

@@ -30,7 +30,6 @@ MEASUREMENTS = {
     "similarity": "cosine similarity of the global descriptors",
     "inliers_image": "pairs of image features that one homography explains",
     "inliers_cloud": "pairs of the scan's features that one rigid motion explains",
-    "superfeatures": "eligible pairs of super-features, where the reranking goes by them",
     "residual_m": "median point-to-plane distance of the scans; of views, median distance of paired points",
     "residual_p90_m": "nine of ten points are nearer than this to their counterpart's plane",
     "noise_m": "how far the match's points scatter about their own planes",

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.config import Verification
-from umf_ros.core.frames import Candidate, Keyframe, LocalFeatures, SuperFeatures
+from umf_ros.core.frames import Candidate, Keyframe, LocalFeatures
 from umf_ros.core.geometry import Array, align, relative, transform
 from umf_ros.core.resources import find
 from umf_ros.verification import constants as const
@@ -83,20 +83,22 @@ WITHOUT: dict[str, Any] = {
 """Features that a choice of modalities takes out of an embedding."""
 Offered = tuple[Candidate, Keyframe]
 """A candidate with its keyframe."""
-SUPER = ("super_image", "super_cloud")
 Counts = dict[str, int | None]
 """Pairs that agree by feature type; None where a side has none."""
+Counter = Callable[[Keyframe, Keyframe, Verification], Counts]
+"""Counts what the features of a query and a match have in common."""
 
 
-def rerank(query: Keyframe, candidates: Sequence[Offered], settings: Verification) -> list[Offered]:
+def rerank(
+    query: Keyframe, candidates: Sequence[Offered], settings: Verification, count: Counter | None = None
+) -> list[Offered]:
     """The candidates with their inliers and scores, best first; equals are ordered by similarity, then by age."""
-    count = _by_superfeatures if settings.rerank == "superfeatures" else _by_ransac
     query = replace(query, embedding=replace(query.embedding, **WITHOUT[settings.modalities]))
     ranked = []
     for candidate, keyframe in candidates:
-        counts = count(query, keyframe, settings)
-        image, cloud, *both = (float(counts.get(name) or 0) for name in (settings.features, "cloud", *SUPER))
-        found = replace(candidate, inliers_image=image, inliers_cloud=cloud, superfeatures=sum(both))
+        counts = (count or count_inliers)(query, keyframe, settings)
+        image, cloud = (float(counts.get(name) or 0) for name in (settings.features, "cloud"))
+        found = replace(candidate, inliers_image=image, inliers_cloud=cloud)
         ranked.append((replace(found, score=score(candidate.combined, counts)), keyframe))
     return sorted(ranked, key=lambda item: (-item[0].score, -item[0].combined, item[0].stamp_ns))
 
@@ -156,25 +158,8 @@ def mutual_neighbours(similarity: NDArray[Any]) -> Indices:
     return np.column_stack([rows, best_column[rows]])
 
 
-def eligible_superfeatures(query: SuperFeatures, match: SuperFeatures, ratio: float = 0.9) -> Indices:
-    """IDs whose super-features are each other's nearest, and nearer than `ratio` times the second [UMF eq. 4.1]."""
-    count = min(len(query.descriptors), len(match.descriptors))
-    if count < 2:
-        return np.empty(0, np.intp)
-    similarity = similarities(query.descriptors, match.descriptors)
-    squared = np.maximum(2 - 2 * similarity, 0)
-    pairs = mutual_neighbours(-squared)
-    ids = pairs[pairs[:, 0] == pairs[:, 1], 0]
-    nearest, second = np.partition(squared[ids], 1, axis=1)[:, :2].T
-    return ids[nearest <= ratio**2 * second]
-
-
-def _by_superfeatures(query: Keyframe, match: Keyframe, settings: Verification) -> Counts:
-    pairs = {name: (getattr(query.embedding, name), getattr(match.embedding, name)) for name in SUPER}
-    return {name: len(eligible_superfeatures(*pair)) if all(pair) else None for name, pair in pairs.items()}
-
-
-def _by_ransac(query: Keyframe, match: Keyframe, settings: Verification) -> Counts:
+def count_inliers(query: Keyframe, match: Keyframe, settings: Verification) -> Counts:
+    """Count mutual neighbours that a homography of the images, or a motion of the scans, explains."""
     ours, theirs = query.embedding, match.embedding
     reach = const.IMAGE_THRESHOLD * query.camera.width
     image = _explain(ours.image, theirs.image, fit_homography, reach, settings)

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.config import Loop, Verification
-from umf_ros.core.frames import Candidate, Embedding, Frame, Keyframe, combine
+from umf_ros.core.frames import Candidate, Embedding, Frame, Keyframe, SuperFeatures, combine
 from umf_ros.core.geometry import Array
 from umf_ros.embedding import Embedder
 from umf_ros.lab.datasets.sample import Rule, distances, label, places_of
 from umf_ros.places.database import is_past
 from umf_ros.places.words import FITTED_ON, fit_words
-from umf_ros.verification.rerank import rerank
+from umf_ros.verification.rerank import Counter, Counts, count_inliers, mutual_neighbours, rerank, similarities
 
 THESIS_RULE = Rule(positive_m=12.0, positive_deg=30.0, negative_m=60.0, negative_deg=30.0)
 ROBOTCAR_RULE = Rule(positive_m=10.0, positive_deg=180.0, negative_m=50.0, negative_deg=180.0)
@@ -128,8 +128,7 @@ class PairInliers:
     """
 
     def __init__(self, queries: Sequence[Keyframe], references: Sequence[Keyframe], settings: Verification) -> None:
-        reranker, modalities = METHODS["ransac image"]
-        self._settings = settings.model_copy(update={"rerank": reranker, "modalities": modalities})
+        self._settings = settings.model_copy(update={"modalities": "image"})
         self._queries, self._references = queries, references
         self._worth = np.full((len(queries), len(references)), np.nan)
 
@@ -161,12 +160,34 @@ NOTHING = -1
 TOP_K = 20
 """Candidates that are reranked [UMF 5.5.2]."""
 
-RERANKERS = ("superfeatures", "ransac")
+SUPER = ("super_image", "super_cloud")
+
+
+def eligible_superfeatures(query: SuperFeatures, match: SuperFeatures, ratio: float = 0.9) -> Indices:
+    """IDs whose super-features are each other's nearest, and nearer than `ratio` times the second [UMF eq. 4.1]."""
+    count = min(len(query.descriptors), len(match.descriptors))
+    if count < 2:
+        return np.empty(0, np.intp)
+    similarity = similarities(query.descriptors, match.descriptors)
+    squared = np.maximum(2 - 2 * similarity, 0)
+    pairs = mutual_neighbours(-squared)
+    ids = pairs[pairs[:, 0] == pairs[:, 1], 0]
+    nearest, second = np.partition(squared[ids], 1, axis=1)[:, :2].T
+    return ids[nearest <= ratio**2 * second]
+
+
+def count_superfeatures(query: Keyframe, match: Keyframe, settings: Verification) -> Counts:
+    """Count the eligible super-features of images and of scans."""
+    pairs = {name: (getattr(query.embedding, name), getattr(match.embedding, name)) for name in SUPER}
+    return {name: len(eligible_superfeatures(*pair)) if all(pair) else None for name, pair in pairs.items()}
+
+
+RERANKERS: dict[str, Counter] = {"superfeatures": count_superfeatures, "ransac": count_inliers}
 PARTS = {"image": "image", "lidar": "cloud", "both": "both"}
 """Which local features a reranker uses: what it is called here and in the settings."""
 
 METHODS = {f"{reranker} {part}": (reranker, modalities) for reranker in RERANKERS for part, modalities in PARTS.items()}
-"""The settings `rerank` and `modalities` of every way to rerank."""
+"""Name in `RERANKERS` and setting `modalities` of every way to rerank."""
 
 NO_POINTS = np.empty((0, 3), np.float32)
 
@@ -333,7 +354,7 @@ def rerank_all(
         report: called after every query.
     """
     heads = ranking.order[:, :TOP_K]
-    chosen = {name: settings.model_copy(update={"rerank": r, "modalities": m}) for name, (r, m) in METHODS.items()}
+    chosen = {name: (settings.model_copy(update={"modalities": m}), RERANKERS[r]) for name, (r, m) in METHODS.items()}
     scores: dict[str, Array] = {method: np.zeros(heads.shape) for method in METHODS}
     took: dict[str, list[float]] = {method: [] for method in METHODS}
     for row, (query, head) in enumerate(zip(queries, heads, strict=True)):
@@ -344,7 +365,7 @@ def rerank_all(
         ]
         for method, way in chosen.items():
             started = time.perf_counter()
-            ranked = rerank(query, candidates, way)
+            ranked = rerank(query, candidates, *way)
             took[method].append(1e3 * (time.perf_counter() - started))
             for candidate, _ in ranked:
                 scores[method][row, candidate.index] = candidate.score

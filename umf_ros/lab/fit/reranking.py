@@ -25,28 +25,36 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from umf_ros.core.config import EmbeddingSettings, Verification
-from umf_ros.core.frames import Candidate, Frame, Keyframe
+from umf_ros.core.frames import Frame, Keyframe
 from umf_ros.core.geometry import Array
 from umf_ros.core.io import write_atomically
 from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.local_features import WithXFeat
 from umf_ros.embedding.umf import make
 from umf_ros.lab.evaluation.places import PlaceSet, read_place_sets, read_set
-from umf_ros.lab.evaluation.retrieval import THESIS_RULE, TOP_K, Mask, RetrievalTask, as_keyframe, place_recognition
+from umf_ros.lab.evaluation.retrieval import (
+    RERANKERS,
+    THESIS_RULE,
+    TOP_K,
+    Mask,
+    RetrievalTask,
+    as_keyframe,
+    place_recognition,
+)
 from umf_ros.lab.evaluation.worlds import FIRST, QUICK, REVISIT, TestWorld
-from umf_ros.verification.rerank import log_ratio, rerank
+from umf_ros.verification.rerank import log_ratio
 
 SEEDS = (*range(5000, 5016), *range(10000, 10008))
 SAMPLING = replace(QUICK, revisit=2)
 DEFAULT_OUT = Path("config/verification/reranking.json")
 METHODS = {
-    "xfeat": ("ransac", "image", "inliers_image"),
-    "umf": ("ransac", "image", "inliers_image"),
-    "cloud": ("ransac", "cloud", "inliers_cloud"),
-    "super_image": ("superfeatures", "image", "superfeatures"),
-    "super_cloud": ("superfeatures", "cloud", "superfeatures"),
+    "xfeat": ("ransac", "xfeat"),
+    "umf": ("ransac", "xfeat"),
+    "cloud": ("ransac", "cloud"),
+    "super_image": ("superfeatures", "super_image"),
+    "super_cloud": ("superfeatures", "super_cloud"),
 }
-"""How each feature type is counted: `rerank` and `modalities` of the settings, and the count of the candidate."""
+"""How each feature type is counted: the name in `RERANKERS`, and in what that counts."""
 USED = {"ransac": ("xfeat", "cloud"), "ransac, umf": ("umf", "cloud"), "superfeatures": ("super_image", "super_cloud")}
 NEIGHBOURS = 5  # by hand: references of a set this near to a true one, in their order, are neither right nor wrong
 # on squared slopes, per standard deviation: real sets in which the similarity leaves no doubt must not set its slope.
@@ -160,16 +168,9 @@ class ExampleMaker:
 
 def _counts(name: str, query: Keyframe, matches: list[Keyframe]) -> Array:
     """(K,) what a query shares with its candidates of one feature type, NaN where a side has none."""
-    way, modalities, count = METHODS[name]
-    part = name if way == "superfeatures" else modalities
-    settings = Verification.model_validate({"rerank": way, "modalities": modalities})
-    offered = [(Candidate(index, one.stamp_ns, 0.0), one) for index, one in enumerate(matches)]
-    found = np.full(len(matches), np.nan)
-    for candidate, match in rerank(query, offered, settings):
-        sides = [getattr(one.embedding, part) for one in (query, match)]
-        if all(side is not None and len(side.descriptors) for side in sides):
-            found[candidate.index] = getattr(candidate, count)
-    return found
+    way, counted = METHODS[name]
+    found = [RERANKERS[way](query, match, Verification())[counted] for match in matches]
+    return np.array(found, float)  # None becomes NaN
 
 
 def fit(examples: Sequence[Examples]) -> Fitted:
