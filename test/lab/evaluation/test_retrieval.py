@@ -109,24 +109,6 @@ def test_only_the_first_candidates_are_reordered(gathered) -> None:
     assert np.array_equal(reranking.after("ransac both", 1).order, ranking.order)
 
 
-def test_recall_grows_when_the_right_place_comes_among_the_candidates(gathered) -> None:
-    _, reranking, _ = gathered
-    ranking = reranking.before
-    positive = np.arange(PLACES)[None] == np.array(ASKED)[:, None]
-    where = [list(row).index(place) + 1 for row, place in zip(ranking.order, ASKED, strict=True)]
-    curve = reranking.recall1_by_candidates("ransac both", positive)
-    expected = [sum(place <= count for place in where) / 3 for count in range(1, TOP_K + 1)]
-    np.testing.assert_allclose(curve, expected)
-    assert curve[0] == pytest.approx(1 / 3) and curve[-1] == 1.0
-
-
-def test_queries_without_a_true_match_do_not_count_for_the_curve(gathered) -> None:
-    _, reranking, _ = gathered
-    positive = np.zeros((3, PLACES), bool)
-    positive[0, 0] = True
-    assert reranking.recall1_by_candidates("ransac both", positive).tolist() == [1.0] * TOP_K
-
-
 def test_a_query_with_fewer_candidates_is_reranked_among_them() -> None:
     queries, references = keyframes(1000, [3, 5]), keyframes(0, list(range(PLACES)))
     similarity = np.array([[q.embedding.descriptor @ r.embedding.descriptor for r in references] for q in queries])

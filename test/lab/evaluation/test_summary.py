@@ -67,7 +67,6 @@ def world(name: str, recall1: float, yaw: list[YawBin], **others: Scores) -> Wor
         references=858,
         scores=every | named,
         yaw=yaw,
-        by_candidates={"ransac": np.linspace(recall1, 1, 20)},
         milliseconds={"superfeatures": 4.0, "ransac": 20 * recall1},
     )
 

@@ -33,9 +33,7 @@ def test_confused_places_cost_recall_and_reranking_wins_them_back(result: WorldR
     assert result.scores["ransac both"].recall_at_precision1 == 1.0
 
 
-def test_candidates_beyond_the_first_are_needed(result: WorldResult) -> None:
-    for curve in result.by_candidates.values():
-        assert curve[0] == pytest.approx(1 - len(CONFUSED) / PLACES) and curve[-1] == 1.0
+def test_the_time_of_reranking_is_taken(result: WorldResult) -> None:
     assert set(result.milliseconds) == {"superfeatures", "ransac"}
 
 

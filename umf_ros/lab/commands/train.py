@@ -136,9 +136,6 @@ def export(
     weights: Annotated[
         Path | None, typer.Option(help="Weights of UMF, or models/xfeat.safetensors; default: umf_scene.")
     ] = None,
-    super_features: Annotated[
-        bool, typer.Option("--super-features", help="Include the super-features in an .xml; .openvino has them.")
-    ] = False,
     precision: Annotated[
         Literal["float32", "int8"],
         typer.Option(help="Precision of the convolutions; int8 takes less than half of the time."),
@@ -174,7 +171,7 @@ def export(
     def report(text: str) -> None:
         progress.print(text, markup=False, soft_wrap=True)
 
-    outputs = outputs_of(FeatureRequest(supers=super_features or out.suffix == MODEL_SUFFIX))
+    outputs = outputs_of(FeatureRequest(supers=True))
     model = export_model(located, precision, calibration, report, outputs)
     save_model(model, out)
     weighed = out.with_suffix(".bin") if out.suffix == ".xml" else out

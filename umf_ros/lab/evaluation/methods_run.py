@@ -54,7 +54,6 @@ PICTURES = {
     "Recall@1 of all methods": "methods.png",
     "Precision and recall (figure 5.13)": "precision_recall.png",
     "Recall among the first candidates": "recall.png",
-    "Recall@1 by number of reranked candidates (figure 5.12)": "candidates.png",
 }
 
 
@@ -122,7 +121,6 @@ class MethodsRun:
         self._answers: dict[str, dict[str, MethodAnswers]] = {}
         self._xfeat: dict[str, list[float]] = {}
         self._reranked: dict[str, list[MethodAnswers]] = {name: [] for name in METHODS}
-        self._candidates: dict[str, list[np.ndarray]] = {name: [] for name in RERANKED}
         self._rerank_ms: dict[str, list[float]] = {}
         self._seen: list[Frame] = []
         self._keyframe: Keyframe | None = None
@@ -177,7 +175,6 @@ class MethodsRun:
             found.append(ask(task, again.after(method), places.unanswerable_count))
         for name, method in RERANKED.items():
             self._keep(name, places.name, self._reranked[method][-1])
-            self._candidates[name].append(again.recall1_by_candidates(method, task.positive))
             if method.split()[0] in again.milliseconds:
                 self._rerank_ms.setdefault(name, []).append(again.milliseconds[method.split()[0]])
 
@@ -233,8 +230,6 @@ class MethodsRun:
         )
         recalls = {name: np.mean([one.scores.recalls for one in each], axis=0) for name, each in shown.items()}
         plot_recall(folder / "recall.png", recalls, "candidates")
-        by_count = {name: np.mean(each, axis=0) for name, each in self._candidates.items() if each}
-        plot_recall(folder / "candidates.png", by_count, "candidates reranked")
         tables = {
             "Place recognition by all methods (as UMF table 5.4)": methods_table(results),
             "Recall@1 by set": sets_table(results),

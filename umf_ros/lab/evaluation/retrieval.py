@@ -300,12 +300,6 @@ class Reranking:
         """The ranking after reranking the first `candidates`."""
         return self.before.reordered(self.scores[method][:, :candidates])
 
-    def recall1_by_candidates(self, method: str, positive: Mask) -> Array:
-        """(K,) recall@1 of the answerable queries when the first 1, 2, ... K are reranked (figure 5.12)."""
-        answerable = positive.any(axis=1)
-        counts = range(1, TOP_K + 1)
-        return np.array([self.after(method, count).hits(positive)[answerable, 0].mean() for count in counts])
-
 
 def word_similarity(queries: Sequence[Keyframe], references: Sequence[Keyframe]) -> Array:
     """(Q, R) similarity by words of the first references, as in a place database; 0 without an image or too few."""

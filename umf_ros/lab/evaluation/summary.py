@@ -14,7 +14,6 @@ import numpy as np
 from umf_ros.baselines.place_network import count_parameters
 from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.frames import Frame
-from umf_ros.core.geometry import Array
 from umf_ros.embedding import Embedder
 from umf_ros.embedding.umf import UmfEmbedder
 from umf_ros.lab.evaluation.results import Figures, Scores, TextTable, YawBin, mean, percent, rounded, scores_table
@@ -75,7 +74,6 @@ class WorldResult:
         references: samples of the first pass.
         scores: by what was asked: modes, rerankers, "same light".
         yaw: recall@1 by difference of heading, opposite direction included.
-        by_candidates: (K,) recall@1 by number of reranked candidates, by reranker.
         milliseconds: of the rerankers per query.
         examples: some frames, to take times.
     """
@@ -84,7 +82,6 @@ class WorldResult:
     references: int
     scores: dict[str, Scores]
     yaw: list[YawBin]
-    by_candidates: dict[str, Array]
     milliseconds: dict[str, float]
     examples: list[Frame] = field(default_factory=list)
 

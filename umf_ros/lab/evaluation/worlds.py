@@ -25,7 +25,6 @@ from umf_ros.lab.evaluation.results import (
 from umf_ros.lab.evaluation.retrieval import (
     METHODS,
     MODES,
-    RERANKERS,
     Indices,
     PlaceCollection,
     Ranking,
@@ -185,7 +184,6 @@ TIMED_FRAMES = 8
 PICTURES = {
     "Precision and recall (figure 5.13)": "precision_recall.png",
     "Recall among the first candidates": "recall.png",
-    "Recall@1 by number of reranked candidates (figure 5.12)": "candidates.png",
 }
 
 
@@ -228,7 +226,6 @@ class WorldEvaluation:
                 **{method: score(task, reranking.after(method)) for method in METHODS},
             },
             yaw=self._recall_by_yaw(),
-            by_candidates={name: reranking.recall1_by_candidates(f"{name} both", task.positive) for name in RERANKERS},
             milliseconds=reranking.milliseconds,
             examples=[self._frames[row] for row in evenly(len(self._frames), TIMED_FRAMES)],
         )
@@ -324,11 +321,6 @@ class WorldsRun:
         plot_precision_recall(folder / "precision_recall.png", curves)
         recalls = {name: np.mean([result.scores[name].recalls for result in results], axis=0) for name in RERANKED}
         plot_recall(folder / "recall.png", recalls, "candidates")
-        by_count = {
-            name: np.mean([result.by_candidates[name] for result in results], axis=0)
-            for name in results[0].by_candidates
-        }
-        plot_recall(folder / "candidates.png", by_count, "candidates reranked")
 
 
 def work(world: TestWorld) -> int:
