@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import re
-import socket
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.postgres import free_port
 
 from umf_ros.absolute.measurement import AbsoluteReason, AbsoluteVerdict, Aid, write_verdicts
 from umf_ros.core.config import TerrainSettings, Verification
 from umf_ros.core.errors import ConfigError, OutputError
 from umf_ros.core.frames import Candidate, Frame, Keyframe, State
+from umf_ros.core.io import write_table
 from umf_ros.detector import Detection
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 from umf_ros.runs import rerun_log
 from umf_ros.runs.rerun_log import RerunLog
+from umf_ros.runs.run_file import CLOSURES
 from umf_ros.verification import Verifier
 
 pytest.importorskip("rerun")
@@ -37,6 +37,7 @@ def run(path: Path | None, folder: Path) -> None:
     first, again = take(GROUND, there, 10.0, odom=there), take(GROUND, here, 100.0, odom=here)
     verdicts = Verifier(Verification()).verify(again, [(Candidate(0, first.stamp_ns, 0.7), first)])
     assert verdicts[0].closure is not None
+    write_table(folder / "closures.csv", CLOSURES, [])
     log = RerunLog(path, TerrainSettings())
     for item, detection in zip(
         log.watch([seen(first), seen(again)]),
@@ -74,39 +75,28 @@ def test_the_map_and_verdicts_by_state_are_in_the_file(tmp_path: Path) -> None:
     assert {"/map/cloud", "/map/grid", "/map/closures/accepted", "/map/absolute/rejected"} <= found
 
 
-@pytest.fixture
-def receiver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """What listens where a viewer would, and writes what it receives into a file."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    monkeypatch.setattr(rerun_log, "PORT", port)
-    path = tmp_path / "received.rrd"
-    command = [RERUN, "--save", str(path), "--port", str(port)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr
-        while "Saving incoming" not in (line := process.stderr.readline()):
-            assert line, "it ended"
-        yield path
-        process.terminate()
-
-
-def test_a_viewer_that_listens_shows_the_run(receiver: Path, tmp_path: Path) -> None:
+def test_a_viewer_that_listens_shows_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "trajectory_optimized.tum").write_text("10.0 -15 0 0 0 0 0 1\n11.0 -14 0 0 0 0 0 1\n")
-    run(None, tmp_path)
-    expected = {"/camera/left", "/rover/scan", "/trajectory/optimized", "/map/closures/accepted"}
-    for _ in range(100):  # it writes in a thread
-        if expected <= (found := logged(receiver)):
-            break
-        time.sleep(0.1)
-    assert expected <= found
+    monkeypatch.setattr(rerun_log, "PORT", free_port())
+    command = [
+        RERUN,
+        "--save",
+        str(tmp_path / "seen.rrd"),
+        "--port",
+        str(rerun_log.PORT),
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as receiver:
+        assert receiver.stderr and any("Saving incoming" in line for line in iter(receiver.stderr.readline, ""))
+        run(None, tmp_path)  # the receiver stands for a viewer, without a window
+        seen = (logged(tmp_path / "seen.rrd") for _ in range(100))  # it writes in a thread
+        assert any({"/camera/left", "/rover/scan", "/trajectory/optimized", "/map/cloud"} <= one for one in seen)
+        receiver.terminate()
 
 
 def test_without_a_viewer_and_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as closed:
-        monkeypatch.setattr(rerun_log, "PORT", closed.getsockname()[1])
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(ConfigError, match=r"there is no display, .*--rerun FILE"):
+    monkeypatch.setattr(rerun_log, "PORT", free_port())
+    monkeypatch.setattr("os.environ", {})
+    with pytest.raises(ConfigError, match=r"no display, .*--rerun FILE"):
         RerunLog(None, TerrainSettings())
 
 

@@ -101,4 +101,4 @@ def test_the_command_prints_precision_and_doubts_and_writes_a_table(tmp_path: Pa
 
 def test_a_folder_without_a_run_is_one_line(tmp_path: Path) -> None:
     done = umf("judge", tmp_path)
-    assert done.status == 1 and "holds no run" in done.err and len(done.err.splitlines()) == 1
+    assert done.status == 1 and "holds no finished run" in done.err and len(done.err.splitlines()) == 1

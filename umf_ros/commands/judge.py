@@ -7,12 +7,16 @@ from typing import Annotated
 
 import typer
 
+from umf_ros.commands import recordings as options
+
 
 def command(folder: Annotated[Path, typer.Argument(help="A run folder, such as results/latest.")]) -> None:
     """Judge the closures of a run without ground truth, by loops, independent closures and the overlap of local maps.
 
     Prints their precision with an interval of 95 %, and the closures it doubts; writes self_check.csv into the folder.
     """
+    options.check_run(folder)
+
     from umf_ros.runs.self_check import TABLE, check_run
 
     found = check_run(folder)

@@ -29,9 +29,7 @@ RayAddress = Annotated[
 MapPath = Annotated[Path, typer.Option("--out", help="Folder of the map, new or one to add to.")]
 OdometryFolder = Annotated[
     Path | None,
-    typer.Option(
-        "--odometry", help="Folder of TUM files named like the recordings; else their own, or that of the scans."
-    ),
+    typer.Option("--odometry", help="Folder of TUM files named like recordings; else their own, or that of scans."),
 ]
 
 
@@ -40,15 +38,12 @@ Pair = Annotated[
 ]
 
 
-COMMANDS = ("edit", "grow", "export", "import-cloud")
-
-
 class _MakeOrChange(TyperGroup):
-    """`umf map RECORDINGS` makes a map; `COMMANDS` are those beside that."""
+    """`umf map RECORDINGS` makes a map; other commands are named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Name the usual command where none is named."""
-        return super().parse_args(ctx, args if args and args[0] in COMMANDS else ["make", *args])
+        return super().parse_args(ctx, args if args and args[0] in self.commands else ["make", *args])
 
 
 ALSO = (

@@ -17,12 +17,8 @@ if TYPE_CHECKING:
     from umf_ros.core.config import Settings
     from umf_ros.localizer import Localization
 
-MinProbability = Annotated[
-    float | None, typer.Option("--min-probability", min=0, max=1, help="Least probability of a published closure.")
-]
-Resume = Annotated[
-    bool, typer.Option("--resume", help="Continue the newest interrupted replay of this recording in --out.")
-]
+MinProbability = Annotated[float | None, typer.Option(min=0, max=1, help="Minimum probability of a published closure.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue the newest interrupted replay in --out.")]
 RerunPath = Annotated[Path | None, typer.Option("--rerun", help="Also log the run for the Rerun viewer: an .rrd file.")]
 Viewer = Annotated[bool, typer.Option("--viewer", help="Show the run in the Rerun viewer while it runs.")]
 Mode = Annotated[str | None, typer.Option("--mode", help="mapping, or localization in the map that --map names.")]
@@ -158,11 +154,12 @@ def command(
 
 def _tell_inputs(console: Console, settings: Settings) -> None:
     """Print which inputs were found where no parameter and no data set names them."""
+    from umf_ros.commands.console import PLAIN
     from umf_ros.core.config import TRANSFORMS
     from umf_ros.sensors.topic_finder import describe_inputs
 
     if settings.calibration == TRANSFORMS:
-        console.print(describe_inputs(settings), markup=False, highlight=False, soft_wrap=True)
+        console.print(describe_inputs(settings), **PLAIN)
 
 
 def _grow(console: Console, settings: Settings, folder: Path) -> None:
@@ -190,8 +187,8 @@ def _report_localization(console: Console, folder: Path, counts: dict[str, Any],
     """Print the result of a localising run; return 3 if the rover was not localised."""
     text = "not localised in the map"
     if counts["located"]:
-        located = f"{counts['located']} of {counts['keyframes']}"
-        text = f"localised after {counts['keyframes_until_found']} keyframes, pose known at {located}"
+        text = "localised after {keyframes_until_found} keyframes, pose known at {located} of {keyframes}"
+        text = text.format_map(counts)
     if newest is not None:
         x, y, z = newest.map_T_body[:3, 3]
         sigma_m = float(newest.covariance[:2, :2].trace() ** 0.5)

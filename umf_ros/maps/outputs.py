@@ -68,8 +68,7 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     thickness = {name: None if isnan(value) else round(value, 4) for name, value in found.items()}
     summary = summarise(joint) | {"thickness_m": thickness, "ground": ground, "world": None}
     for one in summary["sessions"]:
-        run = folder.folder_of(one["name"])  # no recording was replayed for some drives
-        one["findings"] = read_summary(run).get("findings", []) if (run / "summary.json").is_file() else []
+        one["findings"] = summary_of(folder, one["name"]).get("findings", [])
     if joint.world is not None:
         world_T_map, origin = joint.world
         summary["world"] = {"origin": origin.tolist(), "world_T_map": world_T_map.tolist()}
@@ -78,6 +77,12 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     write_atomically(path / "summary.json", json.dumps(summary, indent=2) + "\n")
     _write_report(path, summary)
     return summary
+
+
+def summary_of(folder: MapFolder, session: str) -> dict[str, Any]:
+    """Return the summary of a session's replay; empty for a drive without a recording."""
+    run = folder.folder_of(session)
+    return read_summary(run) if (run / "summary.json").is_file() else {}
 
 
 def summarise(joint: JointMap) -> dict[str, Any]:

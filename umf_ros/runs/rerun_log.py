@@ -72,15 +72,12 @@ class RerunLog:
         self._scans = TemporaryFile()  # noqa: SIM115 (deleted with the log)
 
     def _open_viewer(self) -> None:
-        try:
-            socket.create_connection(("127.0.0.1", PORT), 1.0).close()
-        except OSError:
-            if not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
-                text = f"--viewer: there is no display, and no viewer at port {PORT}; --rerun FILE writes a file for it"
-                raise ConfigError(text) from None
-            program = str(Path(sys.executable).with_name("rerun"))
-            self._rerun.spawn(port=PORT, connect=False, recording=self._log, executable_path=program)
-        self._log.connect_grpc(f"rerun+http://127.0.0.1:{PORT}/proxy")
+        with socket.socket() as probe:
+            is_open = not probe.connect_ex(("127.0.0.1", PORT))
+        if not is_open and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
+            raise ConfigError(f"--viewer: no display, and no viewer at port {PORT}; --rerun FILE writes a file for it")
+        program = str(Path(sys.executable).with_name("rerun"))
+        self._rerun.spawn(port=PORT, recording=self._log, executable_path=program)  # or the one that listens
 
     def watch(self, stream: Iterable[Item]) -> Iterator[Item]:
         """Yield the same stream; its latest frame is kept until its detection is logged."""
@@ -130,8 +127,7 @@ class RerunLog:
             colours = [GRID_COLOURS[value] for value in values.tolist()]
             self._log.log("map/cloud", rerun.Points3D(points, radii=0.05, colors=[GREY]), static=True)
             self._log.log("map/grid", rerun.Points3D(cells, radii=settings.cell_m / 2, colors=colours), static=True)
-        closures = folder / "closures.csv"
-        verdicts = read_verdicts(folder / "graph_verdicts.csv", read_closures(closures) if closures.is_file() else ())
+        verdicts = read_verdicts(folder / "graph_verdicts.csv", read_closures(folder / "closures.csv"))
         measured = read_absolute_verdicts(folder / "absolute_verdicts.csv")
         for state, colour in STATE_COLOURS.items():
             stamps = np.array([key for key, one in verdicts.items() if one.state is state], np.int64).reshape(-1, 2)
