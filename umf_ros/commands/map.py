@@ -299,7 +299,7 @@ def _print_summary(out: Path, summary: dict[str, Any], console: Console) -> None
 
     for one in summary["sessions"]:
         told = f"joined by {one['closures_between']} ends of closures with others"
-        told = told if one["joined"] else "not joined: no accepted closure with the map yet"
+        told = told if one["joined"] and one["closures_between"] else "no accepted closure with others yet"
         size = f"{one['places']} places, {one['length_m']:.0f} m"
         told = f"; {told}" if len(summary["sessions"]) > 1 else ""
         console.print(f"  {one['name']}: {size}{told}", markup=False, soft_wrap=True)
