@@ -43,8 +43,8 @@ def test_a_moment_is_a_stamp_or_seconds(run: Path) -> None:
 
 
 def test_what_is_wrong_is_one_line(run: Path, tmp_path: Path) -> None:
-    assert only_line(umf("why", tmp_path, "3")) == f"{tmp_path} holds no finished run: summary.json is missing"
     for command in ("why", "judge", "report"):
+        assert only_line(umf(command, tmp_path)) == f"{tmp_path} holds no finished run: summary.json is missing"
         assert only_line(umf(command, run.parent)).endswith(f"holds runs and is none; did you mean {run}?")
         assert only_line(umf(command, bag := run.parents[1] / "small.mcap")).endswith(f"umf replay {bag} makes one")
     for moment in ("500", str(START_NS - 2 * 10**9)):
