@@ -70,6 +70,9 @@ def test_sessions_of_a_wrong_mounting_are_apart(mini_bag: Path, again: Path, min
     changes = "--set", f"calibration={tmp_path / 'wrong.yaml'}", "--out", tmp_path / "map"
     told = umf("map", mini_bag, again, "--config", mini_config, *changes).text
     assert "correct body_T_lidar of the calibration or /tf_static: quaternion: [" in told
+    assert "mini: the LiDAR's mounting is off by 8" in (tmp_path / "map" / "report.html").read_text().replace(
+        "&#39;", "'"
+    )
     assert "closures are withheld" in told and "1 of 2 sessions in one frame; closures between them: 0 found" in told
 
 

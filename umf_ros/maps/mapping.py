@@ -58,7 +58,7 @@ OnFrame = Callable[[float, Detection], None]
 """Called for every frame with the processed share of the recording, 0 to 1, and the detection."""
 RECORDINGS = (".mcap", ".db3", ".bag")
 REMEDY = "which a map needs: give --odometry FILE.tum"
-WITHHELD = "closures are withheld; when it is corrected, make the map in another folder: --out"
+WITHHELD = "closures are withheld until that is corrected; then make the map in another folder (--out)"
 FEWEST = 2
 """Places of a session: one alone has no odometry to anything."""
 
