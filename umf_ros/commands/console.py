@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from threading import Event, Thread
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from umf_ros.detector import Detection
+if TYPE_CHECKING:
+    from umf_ros.detector import Detection
 
 Handler = Callable[[int, FrameType | None], Any] | int | signal.Handlers | None
 

@@ -17,10 +17,15 @@ def command(folder: Annotated[Path, typer.Argument(help="A run folder, such as r
     """
     options.check_run(folder)
 
-    from umf_ros.runs.self_check import TABLE, check_run
+    from rich.console import Console
 
-    found = check_run(folder)
-    found.write(folder / TABLE)
+    from umf_ros.commands.console import waiting
+
+    with waiting(Console(), "Judging the closures"):
+        from umf_ros.runs.self_check import TABLE, check_run
+
+        found = check_run(folder)
+        found.write(folder / TABLE)
     for row in found.doubted:
         typer.echo(f"doubted: {found.describe(row)}")
     typer.echo(f"{folder}: {found.sentence}")

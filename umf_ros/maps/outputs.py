@@ -185,14 +185,13 @@ def draw_map(path: Path, joint: JointMap, heights: HeightMap | None = None) -> N
 
 def _write_report(folder: Path, summary: dict[str, Any]) -> None:
     """Write the self-contained `report.html` from the summary and the pictures in the folder of a map."""
-    joined, count = summary["joined"], len(summary["sessions"])
     causes = [f"{one['name']}: {one['findings'][0]}. " for one in summary["sessions"] if one.get("findings")]
     pictures = {"trajectories": folder / "trajectories.png", "ground": folder / "map.png"}
     page = render(
         "map.html",
         name=folder.resolve().name,
         sentence="".join(causes[:1]) + sentence(summary),
-        mark="warn" if joined < count or causes else "good",
+        mark="warn" if causes or summary["joined"] < len(summary["sessions"]) else "good",
         sessions=summary["sessions"],
         crispness=crispness(summary),
         **{name: data_address("image/png", p.read_bytes()) if p.is_file() else "" for name, p in pictures.items()},

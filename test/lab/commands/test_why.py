@@ -24,7 +24,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out" / "latest"
 
 
-def test_it_names_the_gate_and_lists_what_was_returned(run: Path) -> None:
+def test_it_names_the_gate_and_lists_what_was_returned(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")  # no cell is cut
     before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
     ended = umf("why", run, "3.5")
     assert ended.status == 0, ended.text

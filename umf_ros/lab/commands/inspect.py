@@ -12,6 +12,7 @@ from umf_ros.core.errors import OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from umf_ros.bags.reader import Bag
     from umf_ros.lab.evaluation.inspection import Inspected
@@ -62,6 +63,12 @@ def command(
     console.print(ready, style="green", **PLAIN)
 
 
+def print_table(console: Console, table: Table) -> None:
+    """Print a table; a terminal of fewer than 80 columns breaks its lines, and no cell is cut."""
+    table.width = None if console.width >= 80 else 80
+    console.print(table, crop=False)
+
+
 def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None:
     from rich.markup import escape
     from rich.table import Table
@@ -79,7 +86,7 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
         if topic:
             rate = f"{recording.topics[topic].count / max(recording.duration_s, 1e-9):.1f} Hz"
             table.add_row(name, escape(topic), rate, escape(found.found.get(name, "")))
-    console.print(table)
+    print_table(console, table)
     others = sorted(set(recording.topics) - set(found.topics.model_dump().values()))
     if others:
         console.print(f"not used: {', '.join(others)}", style="dim", **PLAIN)

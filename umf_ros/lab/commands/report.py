@@ -9,6 +9,7 @@ import typer
 
 from umf_ros.commands.recordings import TruthPath, check_files, check_run
 from umf_ros.core.errors import UmfError, reading
+from umf_ros.lab.commands.inspect import print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -211,7 +212,7 @@ def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -
             table.add_row(
                 at(one.match_stamp_ns), f"{one.candidate.similarity:.3f}", probability, known, escape(one.outcome)
             )
-        console.print(table)
+        print_table(console, table)
         if others := len(tested) - len(compared):
             say(f"{others} more: {RejectReason.NOT_COMPARED.value}")
     for name, value in sorted(why.contributions.items(), key=lambda one: -abs(one[1]))[:SHOWN]:
