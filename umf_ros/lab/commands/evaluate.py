@@ -180,10 +180,11 @@ class EveryMethod:
         """Evaluate on the keyframes of a recording."""
         from rich.console import Console
 
-        from umf_ros.lab.evaluation.bag_run import recording_set
-
         console = Console()
         opened = options.open(console, None)
+
+        from umf_ros.lab.evaluation.bag_run import recording_set
+
         places = recording_set(options.bag.stem, opened.frames, opened.truth, opened.settings)
         gaps = opened.settings.loop
         note = (
@@ -342,12 +343,13 @@ def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Pa
 def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
+    console = Console()
+    opened = options.open(console, weights)
+
     from umf_ros.core.io import create_run_folder
     from umf_ros.embedding import make_embedder
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
 
-    console = Console()
-    opened = options.open(console, weights)
     settings, bag = opened.settings, options.bag
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, True, settings.verification.features))
     folder = create_run_folder(out, latest=False)
