@@ -83,21 +83,23 @@ def command(
     from rich.console import Console
     from rich.progress import track
 
-    from umf_ros.bags.reader import open_bag
-    from umf_ros.core.io import check_writable
-    from umf_ros.core.tasks import spread
-    from umf_ros.maps.joint_graph import solve
-    from umf_ros.maps.map_folder import MapFolder
-    from umf_ros.maps.mapping import Opening, find_recordings, match_session, unmatched
-    from umf_ros.maps.outputs import write_results
+    from umf_ros.commands.console import waiting
 
     console = Console()
-    check_writable(out)
-    parameters = options.parameters(config, changes)
-    opening = Opening(parameters, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
-    found = find_recordings(recordings)
-    bags = [open_bag(one) for one in found]  # before there is a folder
-    target = MapFolder.open_or_create(out, opening.settings(bags[0]))
+    with waiting(console, "Opening the recordings"):
+        from umf_ros.bags.reader import open_bag
+        from umf_ros.core.io import check_writable
+        from umf_ros.core.tasks import spread
+        from umf_ros.maps.joint_graph import solve
+        from umf_ros.maps.map_folder import MapFolder
+        from umf_ros.maps.mapping import Opening, find_recordings, match_session, unmatched
+        from umf_ros.maps.outputs import write_results
+
+        check_writable(out)
+        parameters = options.parameters(config, changes)
+        opening = Opening(parameters, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
+        bags = [open_bag(one) for one in find_recordings(recordings)]  # before there is a folder
+        target = MapFolder.open_or_create(out, opening.settings(bags[0]))
     new = _new_recordings(target, bags, console)
     if ray is None and workers == 1:
         for name, recording in new.items():
