@@ -19,6 +19,7 @@ printf 'loop: {top_k: 3}\nloop: {top_k: 4}\n' > "$T/twice.yaml"; printf '{"frame
 printf 'a,b\n1,2\n' > "$T/pairs.csv"; printf 'VERTEX_SE3:QUAT x\n' > "$T/wrong.g2o"; printf '1 2 3\n' > "$T/short.tum"
 printf '# .PCD v0.7\nFIELDS a b\n' > "$T/wrong.pcd"
 
+mkdir -p "$T/runs/latest"; : > "$T/runs/latest/run.sqlite"
 mkdir "$T/set"; { printf 'P5 4 4 255\n'; head -c 16 /dev/zero; } > "$T/set/0.pgm"; printf '0.pgm 1600000000.5\n' > "$T/set/times.txt"
 "$UMF" import folder "$T/set" "$T/good.mcap" > /dev/null || exit 2
 
@@ -85,6 +86,9 @@ refused later report "$T/folder" "$T/notes.txt"
 refused later report "$T/run" "$T/notes.txt"
 refused now why "$T/nowhere" 3
 refused now why "$T/folder" 3
+refused now why "$T/runs"
+refused now judge "$T/runs"
+refused now report "$T/good.mcap"
 refused later why "$T/run" 3
 refused now import nonsense "$T" "$T/a.mcap"
 refused now import folder "$T/nowhere" "$T/a.mcap"
@@ -135,10 +139,10 @@ refused later bench places --run "$T/folder"
 # data sets and training
 refused now import nuscenes "$T/nowhere" "$T/a.mcap"
 refused later import nuscenes "$T/folder" "$T/a.mcap"
-refused now adapt "$T/good.mcap"
-refused now adapt "$T/nowhere.mcap" --out "$T/a.safetensors"
-refused later adapt "$T/good.mcap" --out "$T/nowhere/a.safetensors"
-refused later train "$T/nowhere"
+refused now train
+refused now train "$T/folder" --config "$T/nowhere.yaml"
+refused now train "$T/folder" --validation "$T/nowhere"
+refused now train "$T/nowhere"
 refused later train "$T/folder" --out "$T/train"
 refused later train "$T/folder" --method nonsense
 refused later train "$T/folder" --preset nonsense --out "$T/train"
@@ -151,7 +155,7 @@ refused now evaluate
 refused now evaluate "$T/nowhere.yaml"
 refused later evaluate "$T/places.yaml"
 refused later evaluate "$T/more.yaml"
-refused later evaluate --worlds moon
+refused now evaluate --worlds moon
 refused now evaluate --worlds test --count 9
 refused now evaluate --worlds test --methods some
 refused now evaluate "$T/good.mcap" --worlds test

@@ -17,6 +17,7 @@ from sources import rows_of
 
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth, read_tum
+from umf_ros.core.config import load_preset
 from umf_ros.lab.scan_files import parse_pcd, parse_ply
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.runs.run_file import read_closures
@@ -60,6 +61,19 @@ def test_closures_between_are_those_of_the_later_one_with_the_earlier(made: tupl
     for closure in closures:
         assert folder.session_at(closure.query_stamp_ns) is folder.sessions[1]
         assert folder.session_at(closure.match_stamp_ns) is folder.sessions[0]
+
+
+def test_sessions_of_a_wrong_mounting_are_apart(mini_bag: Path, again: Path, mini_config: Path, tmp_path: Path) -> None:
+    calibration = yaml.safe_load(load_preset("simulated").calibration.read_text())
+    calibration["body_T_lidar"]["quaternion"] = [0.0, 0.0, 0.0, 1.0]  # 87 deg off
+    (tmp_path / "wrong.yaml").write_text(yaml.safe_dump(calibration))
+    changes = "--set", f"calibration={tmp_path / 'wrong.yaml'}", "--out", tmp_path / "map"
+    told = umf("map", mini_bag, again, "--config", mini_config, *changes).text
+    assert "correct body_T_lidar of the calibration or /tf_static: quaternion: [" in told
+    assert "mini: the LiDAR's mounting is off by 8" in (tmp_path / "map" / "report.html").read_text().replace(
+        "&#39;", "'"
+    )
+    assert "closures are withheld" in told and "1 of 2 sessions in one frame; closures between them: 0 found" in told
 
 
 def test_what_is_in_the_map_costs_nothing_again(made: tuple[Path, Ended], mini_bag: Path, tmp_path: Path) -> None:

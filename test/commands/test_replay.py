@@ -133,11 +133,8 @@ def test_without_any_odometry_closures_are_found_and_the_graph_is_skipped(
     mini_bag: Path, mini_config: Path, tmp_path: Path
 ) -> None:
     config = tmp_path / "no_odometry.yaml"
-    config.write_text(
-        mini_config.read_text(encoding="utf-8").replace(
-            "loop:", "topics.odometry: '', keyframe.untracked_period_s: 0.4, loop:"
-        )
-    )
+    without = "topics.odometry: '', keyframe.untracked_period_s: 0.4, loop:"
+    config.write_text(mini_config.read_text(encoding="utf-8").replace("loop:", without))
     done = umf("replay", mini_bag, "--config", config, "--odometry", "none", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "the pose graph is skipped" in done.stdout
@@ -149,10 +146,8 @@ def test_without_any_odometry_closures_are_found_and_the_graph_is_skipped(
 
 
 def test_odometry_and_truth_come_from_files(run: Path, mini_bag: Path, mini_config: Path, tmp_path: Path) -> None:
-    odometry, truth = mini_bag.with_suffix(".odometry.tum"), mini_bag.with_suffix(".pos")
-    done = umf(
-        "replay", mini_bag, "--config", mini_config, "--odometry", odometry, "--ground-truth", truth, "--out", tmp_path
-    )
+    files = "--odometry", mini_bag.with_suffix(".odometry.tum"), "--ground-truth", mini_bag.with_suffix(".pos")
+    done = umf("replay", mini_bag, "--config", mini_config, *files, "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "latest" / "summary.json").read_text())
     expected = json.loads((run / "summary.json").read_text())
@@ -169,10 +164,8 @@ def keyframes_so_far(folder: Path) -> int:
 
 
 def test_ctrl_c_keeps_the_results_so_far(mini_bag: Path, mini_config: Path, tmp_path: Path) -> None:
-    arguments = ["replay", str(mini_bag), "--config", str(mini_config), "--out", str(tmp_path)]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "umf_ros.cli", *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+    words = sys.executable, "-m", "umf_ros.cli", "replay", mini_bag, "--config", mini_config, "--out", tmp_path
+    process = subprocess.Popen([*map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     keyframes = tmp_path / "latest" / "keyframes.csv"
     deadline = time.monotonic() + 120
     while keyframes_so_far(tmp_path / "latest") < 6:
@@ -184,16 +177,6 @@ def test_ctrl_c_keeps_the_results_so_far(mini_bag: Path, mini_config: Path, tmp_
     assert [name for name in FILES if not (tmp_path / "latest" / name).is_file()] == []
     summary = json.loads((tmp_path / "latest" / "summary.json").read_text())
     assert summary["keyframes"] == len(keyframes.read_text().splitlines()) - 1
-
-
-def test_a_truncated_recording_is_used_as_far_as_it_goes(mini_bag: Path, mini_config: Path, tmp_path: Path) -> None:
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(mini_bag.read_bytes()[: mini_bag.stat().st_size // 2])
-    done = umf("replay", cut, "--config", mini_config, "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    assert "breaks off" in done.stdout + done.stderr or "truncated" in done.stdout + done.stderr
-    summary = json.loads((tmp_path / "out" / "latest" / "summary.json").read_text())
-    assert summary["keyframes"] > 5
 
 
 @pytest.fixture(scope="module")
@@ -210,20 +193,14 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["{bag}", "--config", "nowhere.yaml"], "cannot read nowhere.yaml"),
         (["{bag}", "--config", "{wrong}"], "unknown parameter loop.topk"),
         (["{bag}", "--config", "{notes}"], "notes.txt: expected names and values, found a str"),
-        (
-            ["{bag}", "--dataset", "kitti"],
-            f"dataset: input should be {either(list(map(repr, dataset_names())))}",
-        ),
+        (["{bag}", "--dataset", "kitti"], f"dataset: input should be {either(list(map(repr, dataset_names())))}"),
         (["{bag}", "--embedder", "magic"], "magic"),
         (["{blind}", "--embedder", "netvlad"], "netvlad reads images alone, and {blind} has none"),
         (["{bag}", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
         (["{bag}", "--weights", "{notes}"], "notes.txt"),
         (["{bag}", "--odometry", "{notes}"], "line 1: expected 8 numbers"),
         (["{bag}", "--odometry", "{early}"], "the odometry file covers none of the recording"),
-        (
-            ["{bag}", "--odometry-frame", "camera"],
-            "--odometry-frame is the frame of the poses in an --odometry file: gi",
-        ),
+        (["{bag}", "--odometry-frame", "camera"], "--odometry-frame is the frame of the poses in an --odometry file:"),
         (["{bag}", "--odometry", "{early}", "--odometry-frame", "wheel"], "unknown frame 'wheel' of the odometry"),
         (["{bag}", "--ground-truth", "nowhere.pos"], "cannot read nowhere.pos"),
         (["{bag}", "--ground-truth", "{notes}"], "notes.txt, line 1"),
@@ -260,7 +237,9 @@ def test_results_that_have_no_place_are_one_clear_line(small: Path, tmp_path: Pa
     assert line.startswith(f"cannot write to {tmp_path}/file/results")
 
 
-def test_a_recording_without_truth_is_not_judged_and_its_name_keeps_its_brackets(tmp_path: Path) -> None:
+def test_a_truncated_recording_is_used_without_truth_not_judged_and_its_name_keeps_its_brackets(
+    tmp_path: Path,
+) -> None:
     whole = write_mcap(tmp_path / "whole.mcap", [entry for entry in traverse(3.0) if entry[0] != TRUTH]).read_bytes()
     bag = tmp_path / "cut [copy].mcap"
     bag.write_bytes(whole[: len(whole) * 2 // 3])
@@ -268,4 +247,5 @@ def test_a_recording_without_truth_is_not_judged_and_its_name_keeps_its_brackets
     assert ended.status == 3, ended.text  # images of another size, and three keyframes
     assert f"{bag} is truncated; its first" in ended.out
     assert "there is no ground truth to judge them by" in ended.text
-    assert json.loads((tmp_path / "out" / "latest" / "summary.json").read_text())["ground_truth"] is None
+    summary = json.loads((tmp_path / "out" / "latest" / "summary.json").read_text())
+    assert summary["ground_truth"] is None and summary["keyframes"] > 2

@@ -30,18 +30,17 @@ def verdict(about: JudgedRun) -> tuple[str, int, str]:
 
 def test_what_was_found_and_used_is_green(tmp_path: Path) -> None:
     about = examined(tmp_path, [closure(50, 10)], verdict=accepted(), truth=trajectory(), ate=(1.5, 0.25))
-    assert verdict(about) == (
-        "good",
-        0,
-        "1 true and 0 false loop closures at 1 revisits, the graph used all of them; trajectory error (ATE, "
-        "rigidly aligned) 1.50 m by odometry, 0.25 m optimised.",
-    )
+    found = "1 true and 0 false loop closures at 1 revisits, the graph used all of them"
+    errors = "trajectory error (ATE, rigidly aligned) 1.50 m by odometry, 0.25 m optimised"
+    assert verdict(about) == ("good", 0, f"{found}; {errors}.")
 
 
 def test_without_a_truth_what_was_found_is_green_and_not_called_true(tmp_path: Path) -> None:
     mark, status, sentence = verdict(examined(tmp_path, [closure(50, 10)], verdict=accepted()))
     assert (mark, status) == ("good", 0)
     assert sentence.startswith("1 loop closures; there is no ground truth to judge them by")
+    cut = examined(tmp_path, [closure(50, 10)], verdict=accepted(), warnings=["cut.mcap is truncated"])
+    assert verdict(cut)[2].startswith("cut.mcap is truncated. 1 loop closures")  # its name stays as it is
 
 
 @pytest.mark.parametrize("absent", [(LEFT, RIGHT), (CLOUD,), (ODOMETRY,), ()], ids=str)
@@ -232,14 +231,9 @@ def test_sensors_that_agree_are_not_mentioned(tmp_path: Path) -> None:
 
 def test_losses_of_an_input_are_told_with_their_reasons_and_surplus_images_are_none() -> None:
     left = {"received": 100, "used": 40, "dropped": {"surplus": 30, "late": 20, "size": 10}}
-    found = useless_inputs({"left": left, "right": {"received": 9, "used": 1, "dropped": {"surplus": 8}}})
-    assert found == [
-        Advice(
-            "warning",
-            "30 of 100 messages of the left images could not be used (late 20, size 10)",
-            "a larger sync.max_wait_s waits longer",
-        )
-    ]
+    (found,) = useless_inputs({"left": left, "right": {"received": 9, "used": 1, "dropped": {"surplus": 8}}})
+    what = "30 of 100 messages of the left images could not be used (late 20, size 10)"
+    assert found == Advice("warning", what, "a larger sync.max_wait_s waits longer")
 
 
 def test_the_keyframes_of_the_helper_start_where_they_say() -> None:

@@ -97,8 +97,3 @@ def test_the_command_prints_precision_and_doubts_and_writes_a_table(tmp_path: Pa
     assert f"doubted: closure {30 * 10**9} {(30 + LAP) * 10**9}, 100.0 s back" in done.out
     table = read_table(tmp_path / TABLE, lambda row: float(row["probability"]))
     assert len(table) == 16 and table[-1] < 0.5 < min(table[:-1])
-
-
-def test_a_folder_without_a_run_is_one_line(tmp_path: Path) -> None:
-    done = umf("judge", tmp_path)
-    assert done.status == 1 and "holds no run" in done.err and len(done.err.splitlines()) == 1

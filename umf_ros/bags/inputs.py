@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -66,23 +66,21 @@ def present_topics(bag: Bag, settings: Settings) -> Topics:
     return topics.model_copy(update=dict.fromkeys([name for name in topics.model_dump() if not counts.get(name)], ""))
 
 
-def absent_inputs(bag: Bag, settings: Settings, odometry_from_file: bool = False) -> list[Advice]:
-    """Return inputs that the settings name and the recording lacks, first whether there is any depth."""
+def absent_inputs(bag: Bag, settings: Settings, odometry_from_file: bool = False) -> Iterator[Advice]:
+    """Yield inputs that the settings name and the recording lacks, first whether there is any depth."""
     topics, present = topics_of(settings).model_dump(), present_topics(bag, settings)
-    found: list[Advice] = []
     if present.left_image and not present.cloud and not present.right_image:
         what = "no depth: one camera, no scans and no right images; places are recognised, but no closure is metric"
         helps = [name for name in ("cloud", "right_image") if _others(name, bag, present)]
         remedies = [_remedy(name, bag, present) for name in helps]
-        found.append(Advice("fault", what, either(remedies) or "record scans or a stereo pair"))
+        yield Advice("fault", what, either(remedies) or "record scans or a stereo pair")
     for name, (severity, text) in _ABSENT.items():
         if getattr(present, name):
             continue
         if topics[name] and not (name == "odometry" and odometry_from_file):
-            found.append(Advice(severity, text.format(topics[name]), _remedy(name, bag, present)))
+            yield Advice(severity, text.format(topics[name]), _remedy(name, bag, present))
         elif name == "odometry" and not odometry_from_file:
-            found.append(Advice("note", text.replace(" on {}", ""), _remedy(name, bag, present)))
-    return found
+            yield Advice("note", text.replace(" on {}", ""), _remedy(name, bag, present))
 
 
 def _others(name: str, bag: Bag, present: Topics) -> list[str]:
@@ -95,9 +93,8 @@ def _others(name: str, bag: Bag, present: Topics) -> list[str]:
 
 def _remedy(name: str, bag: Bag, present: Topics) -> str:
     others = _others(name, bag, present)
-    if name == "odometry":
-        supplied = "--odometry FILE.tum supplies it, or vgicp on scans"
-        return f"--set topics.odometry={others[0]}" if others else supplied
+    if not others and name == "odometry":
+        return "--odometry FILE.tum supplies it, or vgicp on scans"
     if not others:
         return f"the recording has no other {TYPES[name][0]}"
     return f"--set topics.{name}={others[0]}" + (f" (or {either(others[1:])})" if others[1:] else "")
@@ -111,9 +108,8 @@ def input_counts(counters: Mapping[Input, InputCounter]) -> dict[str, Any]:
     }
 
 
-def useless_inputs(inputs: Mapping[str, Any], bag: object = None) -> list[Advice]:
-    """Return inputs of which all or many messages could not be used; `bag` is the path of the recording, if known."""
-    found = []
+def useless_inputs(inputs: Mapping[str, Any], bag: object = None) -> Iterator[Advice]:
+    """Yield inputs of which all or many messages could not be used; `bag` is the path of the recording, if known."""
     for name, count in inputs.items():
         lost = Counter({reason: number for reason, number in count["dropped"].items() if reason != "surplus"})
         if not count["received"] or lost.total() <= MUCH_LOST * count["received"]:
@@ -123,5 +119,4 @@ def useless_inputs(inputs: Mapping[str, Any], bag: object = None) -> list[Advice
         details = "" if bag is None else f"details: {command_line('inspect', bag)}"
         remedy = _HELP.get(lost.most_common(1)[0][0], details)
         what = f"{messages} could not be used ({reasons})"
-        found.append(Advice("warning" if count["used"] else "fault", what, remedy))
-    return found
+        yield Advice("warning" if count["used"] else "fault", what, remedy)

@@ -40,8 +40,7 @@ def _contradiction(bag: Bag, name: str) -> str:
     """Return the reason why a recording with the topics of a data set is of another camera, else empty."""
     topics = load_preset(name).topics
     infos = {topics.left_info, f"{topics.left_image.rpartition('/')[0]}/camera_info"}
-    kind = "sensor_msgs/msg/CameraInfo"
-    infos = {topic for topic in infos if topic in bag.topics and bag.topics[topic].type == kind}
+    infos = {topic for topic in infos if bag.types.get(topic) == "sensor_msgs/msg/CameraInfo"}
     sizes: list[tuple[int, int]] = []
     for raw in islice(bag.raw_messages(infos), SAMPLES) if infos else ():
         with suppress(MessageError):
@@ -73,8 +72,10 @@ def settings_for(bag: Bag, config: ParameterSource, dataset: str, **overrides: A
     except BagError as error:
         has_transforms = transform_topics(bag.types) or transform_topics(bag.types, MOVING_TOPIC)
         if not settings.calibration and not has_transforms:
-            advice = f"the parameter calibration names a file, and umf inspect {bag.path} --write . writes a first one"
-            text = f"{error}, and without {TRANSFORMS_TOPIC} its sensors are anywhere; {advice}"
+            advice = (
+                f"the parameter calibration names a file, and umf inspect {bag.path} --write config writes a first one"
+            )
+            text = f"{error}, and without {TRANSFORMS_TOPIC} the mountings of its sensors are unknown; {advice}"
             raise BagError(text) from None
         return with_topics(settings, bag.types)
     return settings.model_copy(update={"dataset": found})

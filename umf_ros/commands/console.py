@@ -8,18 +8,19 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from threading import Event, Thread
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from umf_ros.detector import Detection
+if TYPE_CHECKING:
+    from umf_ros.detector import Detection
 
 Handler = Callable[[int, FrameType | None], Any] | int | signal.Handlers | None
 
-WARNING: dict[str, Any] = {"style": "yellow", "markup": False, "highlight": False, "soft_wrap": True}
-"""Options for printing a warning: file names keep their brackets, lines are not wrapped."""
-
+PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
+"""Options for printing: file names keep their brackets, lines are not wrapped."""
+WARNING: dict[str, Any] = PLAIN | {"style": "yellow"}
 
 EVERY_S = 10.0
 """Time between two lines of progress where the output is no terminal."""

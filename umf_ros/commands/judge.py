@@ -7,16 +7,25 @@ from typing import Annotated
 
 import typer
 
+from umf_ros.commands import recordings as options
+
 
 def command(folder: Annotated[Path, typer.Argument(help="A run folder, such as results/latest.")]) -> None:
     """Judge the closures of a run without ground truth, by loops, independent closures and the overlap of local maps.
 
     Prints their precision with an interval of 95 %, and the closures it doubts; writes self_check.csv into the folder.
     """
-    from umf_ros.runs.self_check import TABLE, check_run
+    options.check_run(folder)
 
-    found = check_run(folder)
-    found.write(folder / TABLE)
+    from rich.console import Console
+
+    from umf_ros.commands.console import waiting
+
+    with waiting(Console(), "Judging the closures"):
+        from umf_ros.runs.self_check import TABLE, check_run
+
+        found = check_run(folder)
+        found.write(folder / TABLE)
     for row in found.doubted:
         typer.echo(f"doubted: {found.describe(row)}")
     typer.echo(f"{folder}: {found.sentence}")

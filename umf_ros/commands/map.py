@@ -29,9 +29,7 @@ RayAddress = Annotated[
 MapPath = Annotated[Path, typer.Option("--out", help="Folder of the map, new or one to add to.")]
 OdometryFolder = Annotated[
     Path | None,
-    typer.Option(
-        "--odometry", help="Folder of TUM files named like the recordings; else their own, or that of the scans."
-    ),
+    typer.Option("--odometry", help="Folder of TUM files named like recordings; else their own, or that of scans."),
 ]
 
 
@@ -40,15 +38,12 @@ Pair = Annotated[
 ]
 
 
-COMMANDS = ("edit", "grow", "export", "import-cloud")
-
-
 class _MakeOrChange(TyperGroup):
-    """`umf map RECORDINGS` makes a map; `COMMANDS` are those beside that."""
+    """`umf map RECORDINGS` makes a map; other commands are named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Name the usual command where none is named."""
-        return super().parse_args(ctx, args if args and args[0] in COMMANDS else ["make", *args])
+        return super().parse_args(ctx, args if args and args[0] in self.commands else ["make", *args])
 
 
 ALSO = (
@@ -88,21 +83,23 @@ def command(
     from rich.console import Console
     from rich.progress import track
 
-    from umf_ros.bags.reader import open_bag
-    from umf_ros.core.io import check_writable
-    from umf_ros.core.tasks import spread
-    from umf_ros.maps.joint_graph import solve
-    from umf_ros.maps.map_folder import MapFolder
-    from umf_ros.maps.mapping import Opening, find_recordings, match_session, unmatched
-    from umf_ros.maps.outputs import write_results
+    from umf_ros.commands.console import waiting
 
     console = Console()
-    check_writable(out)
-    parameters = options.parameters(config, changes)
-    opening = Opening(parameters, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
-    found = find_recordings(recordings)
-    bags = [open_bag(one) for one in found]  # before there is a folder
-    target = MapFolder.open_or_create(out, opening.settings(bags[0]))
+    with waiting(console, "Opening the recordings"):
+        from umf_ros.bags.reader import open_bag
+        from umf_ros.core.io import check_writable
+        from umf_ros.core.tasks import spread
+        from umf_ros.maps.joint_graph import solve
+        from umf_ros.maps.map_folder import MapFolder
+        from umf_ros.maps.mapping import Opening, find_recordings, match_session, unmatched
+        from umf_ros.maps.outputs import write_results
+
+        check_writable(out)
+        parameters = options.parameters(config, changes)
+        opening = Opening(parameters, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
+        bags = [open_bag(one) for one in find_recordings(recordings)]  # before there is a folder
+        target = MapFolder.open_or_create(out, opening.settings(bags[0]))
     new = _new_recordings(target, bags, console)
     if ray is None and workers == 1:
         for name, recording in new.items():
@@ -304,7 +301,7 @@ def _print_summary(out: Path, summary: dict[str, Any], console: Console) -> None
 
     for one in summary["sessions"]:
         told = f"joined by {one['closures_between']} ends of closures with others"
-        told = told if one["joined"] else "not joined: no accepted closure with the map yet"
+        told = told if one["joined"] and one["closures_between"] else "no accepted closure with others yet"
         size = f"{one['places']} places, {one['length_m']:.0f} m"
         told = f"; {told}" if len(summary["sessions"]) > 1 else ""
         console.print(f"  {one['name']}: {size}{told}", markup=False, soft_wrap=True)

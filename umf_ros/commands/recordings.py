@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from umf_ros.core.errors import BagError, ConfigError, UmfError, either
+from umf_ros.core.errors import BagError, ConfigError, UmfError, command_line, either
 from umf_ros.core.resources import MADE_ODOMETRY, dataset_names
 from umf_ros.core.resources import ODOMETRY_ENGINES as ENGINES
 from umf_ros.embedding import choices
@@ -36,11 +36,7 @@ EmbedderName = Annotated[str | None, typer.Option("--embedder", help=f"Embedding
 WeightsPath = Annotated[Path | None, typer.Option("--weights", help="Weights file; default: umf_scene.")]
 OdometryChoice = Annotated[
     str | None,
-    typer.Option(
-        "--odometry",
-        metavar="FILE|ENGINE",
-        help="Odometry as a TUM file, or vgicp: that of the scans, the default where the recording has none; or none.",
-    ),
+    typer.Option("--odometry", metavar="FILE|ENGINE", help="TUM file; vgicp: of the scans, the default without; none."),
 ]
 OdometryFrame = Annotated[
     str,
@@ -61,6 +57,17 @@ def check_files(bag: Path, *others: Path | None) -> None:
     for path in others:
         if path is not None and not path.exists():
             raise ConfigError(f"cannot read {path}: No such file or directory")
+
+
+def check_run(folder: Path) -> None:
+    """Check that a folder holds a run, which may have been killed; else the error names what may be meant."""
+    runs = folder / "latest", *sorted(folder.glob("sessions/*"))
+    if meant := [str(run) for run in runs if (run / "run.sqlite").is_file()]:
+        raise UmfError(f"{folder} holds runs and is none; did you mean {either(meant)}?")
+    if folder.is_file() or (folder / "metadata.yaml").is_file():
+        raise UmfError(f"{folder} is no run folder; of a recording, {command_line('replay', folder)} makes one")
+    if not any((folder / name).is_file() for name in ("summary.json", "run.sqlite")):
+        raise UmfError(f"{folder} holds no finished run: summary.json is missing")
 
 
 def parameters(config: Path | None, changes: list[str] | None) -> Parameters:
@@ -128,10 +135,10 @@ class ChosenOdometry:
     @classmethod
     def parse(cls, choice: str | None, frame: str) -> ChosenOdometry:
         """Return the choice of `--odometry` and `--odometry-frame`; raise a `ConfigError` if they do not fit."""
-        if choice in (None, "none") or (choice in ENGINES and not Path(choice).exists()):
-            check_odometry_options(None, frame)
-            return cls(None, "body", "" if choice == "none" else choice or ENGINES[0], choice in ENGINES)
-        return cls(Path(choice), check_odometry_options(Path(choice), frame))
+        is_file = choice is not None and (choice not in (*ENGINES, "none") or Path(choice).exists())
+        path = Path(choice) if choice and is_file else None
+        engine = "" if path or choice == "none" else choice or ENGINES[0]
+        return cls(path, check_odometry_options(path, frame), engine, choice is not None)
 
     def read(
         self, console: Console, recording: Bag, settings: Settings, made: Path | None, warn: Callable[[str], None]
@@ -146,15 +153,14 @@ class ChosenOdometry:
         """
         from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
         from umf_ros.bags.trajectories import read_odometry
-        from umf_ros.commands.console import LineProgress
+        from umf_ros.commands.console import PLAIN, LineProgress
         from umf_ros.core.config import topics_of
 
         if self.path is not None:
             return read_odometry(self.path, self.frame, settings)
         if not self.engine or not (self.is_wanted or can_track(recording, settings)):
             return None
-        told: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
-        console.print(f"odometry: {self.engine} on the scans of {topics_of(settings).cloud}", **told)
+        console.print(f"odometry: {self.engine} on the scans of {topics_of(settings).cloud}", **PLAIN)
         try:
             with LineProgress(console, "Odometry of the scans") as progress:
                 return odometry_of_scans(recording, settings, self.engine, made, progress.advance_to)
@@ -186,12 +192,8 @@ def show_parameters(
 
     The output is a parameter file.
     """
-    if bag is not None:
-        settings = open_recording(bag, parameters(config, changes))[1]
-    else:
-        from umf_ros.core.config import load_settings
+    from umf_ros.core.config import dump_settings, load_settings
 
-        settings = load_settings(parameters(config, changes))
-    from umf_ros.core.config import dump_settings
-
+    given = parameters(config, changes)
+    settings = load_settings(given) if bag is None else open_recording(bag, given)[1]
     typer.echo(dump_settings(settings), nl=False)

@@ -17,13 +17,10 @@ if TYPE_CHECKING:
     from umf_ros.core.config import Settings
     from umf_ros.localizer import Localization
 
-MinProbability = Annotated[
-    float | None, typer.Option("--min-probability", min=0, max=1, help="Least probability of a published closure.")
-]
-Resume = Annotated[
-    bool, typer.Option("--resume", help="Continue the newest interrupted replay of this recording in --out.")
-]
+MinProbability = Annotated[float | None, typer.Option(min=0, max=1, help="Minimum probability of a published closure.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue the newest interrupted replay in --out.")]
 RerunPath = Annotated[Path | None, typer.Option("--rerun", help="Also log the run for the Rerun viewer: an .rrd file.")]
+Viewer = Annotated[bool, typer.Option("--viewer", help="Show the run in the Rerun viewer while it runs.")]
 Mode = Annotated[str | None, typer.Option("--mode", help="mapping, or localization in the map that --map names.")]
 MapPath = Annotated[
     Path | None, typer.Option("--map", help="Map made by umf map to localise in; implies --mode localization.")
@@ -44,6 +41,7 @@ def command(
     min_probability: MinProbability = None,
     resume: Resume = False,
     rerun: RerunPath = None,
+    live: Viewer = False,
     mode: Mode = None,
     map_folder: MapPath = None,
 ) -> None:
@@ -54,6 +52,7 @@ def command(
     Exit status 3: the inputs could not give any result.
     """
     options.refuse_unused("a mapping run", {"--map": mode == "mapping" and map_folder})
+    options.refuse_unused("a run in the viewer", {"--rerun": live and rerun})
     chosen = options.ChosenOdometry.parse(odometry, odometry_frame)
     options.check_files(bag, config, chosen.path, ground_truth)
     options.check_map(map_folder)
@@ -94,14 +93,14 @@ def command(
     warnings: list[str] = []
     warn = partial(_warn, console, warnings)
     if settings.localizing:
-        options.refuse_unused("a localising run", {"--rerun": rerun, "--resume": resume})
+        options.refuse_unused("a localising run", {"--rerun": rerun, "--viewer": live, "--resume": resume})
     truth = read_ground_truth(None, ground_truth)
     unfinished = unfinished_folder(out, bag, settings) if resume else None
     path = chosen.read(console, recording, settings, unfinished and unfinished / MADE_ODOMETRY, warn)
     with waiting(console, "Loading the network"):
         reader = FrameReader(recording, settings, path, warn=warn)
         network = starting.result()
-        viewer = RerunLog(rerun, settings.terrain) if rerun else None
+        viewer = RerunLog(rerun, settings.terrain) if rerun or live else None
         # a store or a map that cannot be used is reported before there is a folder
         known = settings.database.path or (settings.localizing and not settings.grows_map)
         detector = LoopDetector(settings, network) if known else None
@@ -155,11 +154,12 @@ def command(
 
 def _tell_inputs(console: Console, settings: Settings) -> None:
     """Print which inputs were found where no parameter and no data set names them."""
+    from umf_ros.commands.console import PLAIN
     from umf_ros.core.config import TRANSFORMS
     from umf_ros.sensors.topic_finder import describe_inputs
 
     if settings.calibration == TRANSFORMS:
-        console.print(describe_inputs(settings), markup=False, highlight=False, soft_wrap=True)
+        console.print(describe_inputs(settings), **PLAIN)
 
 
 def _grow(console: Console, settings: Settings, folder: Path) -> None:
@@ -187,8 +187,8 @@ def _report_localization(console: Console, folder: Path, counts: dict[str, Any],
     """Print the result of a localising run; return 3 if the rover was not localised."""
     text = "not localised in the map"
     if counts["located"]:
-        located = f"{counts['located']} of {counts['keyframes']}"
-        text = f"localised after {counts['keyframes_until_found']} keyframes, pose known at {located}"
+        text = "localised after {keyframes_until_found} keyframes, pose known at {located} of {keyframes}"
+        text = text.format_map(counts)
     if newest is not None:
         x, y, z = newest.map_T_body[:3, 3]
         sigma_m = float(newest.covariance[:2, :2].trace() ** 0.5)

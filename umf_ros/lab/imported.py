@@ -102,7 +102,7 @@ def check_absent(*paths: Path) -> None:
     """Raise an `OutputError` if one of some files, which a person may have changed, would be overwritten."""
     for path in paths:
         if path.exists():
-            raise OutputError(f"{path} is there already: nothing was written")
+            raise OutputError(f"{path} is there already: nothing was written; move it, or name another folder")
 
 
 Entry = tuple[int, str, str, Callable[[], Any]]

@@ -39,7 +39,7 @@ from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import Detection, LoopDetector, make_detector_embedder
 from umf_ros.maps.joint_graph import solve
 from umf_ros.maps.map_folder import BETWEEN, MapFolder, MapSession
-from umf_ros.maps.outputs import write_results
+from umf_ros.maps.outputs import summary_of, write_results
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.places.store import delete_sessions, stored_identity, stored_sessions
 from umf_ros.replay import Replay
@@ -49,6 +49,7 @@ from umf_ros.runs.run_file import CLOSURES, COLUMNS, RunFile, closure_row, read_
 from umf_ros.runs.truth import JudgedRun
 from umf_ros.runs.writer import PLACES, begin_folder, count_drops, is_of, is_unfinished
 from umf_ros.sensors.decode import OdometrySample
+from umf_ros.sensors.sensor_check import find_contradictions
 from umf_ros.submaps import SubmapFinder
 from umf_ros.submaps.history import SubmapHistory
 from umf_ros.verification import Hypothesis, Verifier
@@ -57,6 +58,7 @@ OnFrame = Callable[[float, Detection], None]
 """Called for every frame with the processed share of the recording, 0 to 1, and the detection."""
 RECORDINGS = (".mcap", ".db3", ".bag")
 REMEDY = "which a map needs: give --odometry FILE.tum"
+WITHHELD = "closures are withheld until that is corrected; then make the map in another folder (--out)"
 FEWEST = 2
 """Places of a session: one alone has no odometry to anything."""
 
@@ -85,15 +87,10 @@ class Opening:
 
     def odometry_of(self, recording: Path, settings: Settings) -> Trajectory | None:
         """Return the odometry of a recording from its TUM file; None where there is none."""
-        if self.odometry is None:
-            return None
-        if self.odometry.is_file():
-            return read_odometry(self.odometry, self.odometry_frame, settings)
-        for ending in (".tum", ".odometry.tum"):
-            path = self.odometry / f"{recording.stem}{ending}"
-            if path.is_file():
-                return read_odometry(path, self.odometry_frame, settings)
-        return None
+        given, endings = self.odometry, (".tum", ".odometry.tum")
+        files = [given, *(given / f"{recording.stem}{ending}" for ending in endings)] if given else []
+        path = next((one for one in files if one.is_file()), None)
+        return None if path is None else read_odometry(path, self.odometry_frame, settings)
 
 
 def find_recordings(paths: list[Path]) -> list[Path]:
@@ -138,7 +135,9 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
     if not has_odometry:
         raise BagError(f"{recording} has no usable odometry, {REMEDY}")
     found = look_first(JudgedRun(read_run(folder), bag=bag, sensors=sensors))
-    remember_recording(folder, bag, findings=[one.line for one in found if one.severity != "note"])
+    withheld = [WITHHELD] if find_contradictions(sensors) else []
+    lines = [one.line for one in found if one.severity != "note"] + withheld
+    remember_recording(folder, bag, findings=lines, withheld=bool(withheld))
 
 
 def _odometry(bag: Bag, opening: Opening, settings: Settings, folder: Path) -> Trajectory | None:
@@ -213,12 +212,13 @@ def add_places(
 def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Hypothesis]]:
     """Match a recording against the earlier ones; yield the verdicts of every keyframe, accepted ones first.
 
-    Writes `closures_between.csv` atomically. The map's database is only read: several sessions may be
-    matched at once.
+    Closures of sessions whose sensors contradict each other are withheld. Writes `closures_between.csv` atomically.
+    The map's database is only read: several sessions may be matched at once.
     """
     settings = target.settings
     rows = range(session.first_place, session.first_place + session.places)
     found_rows: list[list[Any]] = []
+    wrong = [one for one in target.sessions if summary_of(target, one.name).get("withheld")]
     with closing(open_places(target.places)) as places:
         verifier, number, earlier = Verifier(settings.verification), -1, range(session.first_number)
         submaps = SubmapFinder(settings.verification, settings.loop, places, earlier)
@@ -232,7 +232,8 @@ def match_session(target: MapFolder, session: MapSession) -> Iterator[list[Hypot
             verdicts = verifier.verify(keyframe, [(found, places[found.index]) for found in candidates])
             verdicts = submaps.find(keyframe, verdicts)
             submaps.remember(keyframe)
-            found_rows += [closure_row(v.closure, v.candidate.similarity) for v in verdicts if v.closure]
+            usable = [v for v in verdicts if not any(target.session_at(at) in wrong for at in v.endpoints)]
+            found_rows += [closure_row(v.closure, v.candidate.similarity) for v in usable if v.closure]
             yield verdicts
     write_table(target.folder_of(session.name) / BETWEEN, CLOSURES, found_rows)
 

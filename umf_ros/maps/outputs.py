@@ -68,8 +68,7 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     thickness = {name: None if isnan(value) else round(value, 4) for name, value in found.items()}
     summary = summarise(joint) | {"thickness_m": thickness, "ground": ground, "world": None}
     for one in summary["sessions"]:
-        run = folder.folder_of(one["name"])  # no recording was replayed for some drives
-        one["findings"] = read_summary(run).get("findings", []) if (run / "summary.json").is_file() else []
+        one["findings"] = summary_of(folder, one["name"]).get("findings", [])
     if joint.world is not None:
         world_T_map, origin = joint.world
         summary["world"] = {"origin": origin.tolist(), "world_T_map": world_T_map.tolist()}
@@ -78,6 +77,12 @@ def write_results(folder: MapFolder, joint: JointMap) -> dict[str, Any]:
     write_atomically(path / "summary.json", json.dumps(summary, indent=2) + "\n")
     _write_report(path, summary)
     return summary
+
+
+def summary_of(folder: MapFolder, session: str) -> dict[str, Any]:
+    """Return the summary of a session's replay; empty for a drive without a recording."""
+    run = folder.folder_of(session)
+    return read_summary(run) if (run / "summary.json").is_file() else {}
 
 
 def summarise(joint: JointMap) -> dict[str, Any]:
@@ -180,13 +185,13 @@ def draw_map(path: Path, joint: JointMap, heights: HeightMap | None = None) -> N
 
 def _write_report(folder: Path, summary: dict[str, Any]) -> None:
     """Write the self-contained `report.html` from the summary and the pictures in the folder of a map."""
-    joined, count = summary["joined"], len(summary["sessions"])
+    causes = [f"{one['name']}: {one['findings'][0]}. " for one in summary["sessions"] if one.get("findings")]
     pictures = {"trajectories": folder / "trajectories.png", "ground": folder / "map.png"}
     page = render(
         "map.html",
         name=folder.resolve().name,
-        sentence=sentence(summary),
-        mark="warn" if joined < count or any(one.get("findings") for one in summary["sessions"]) else "good",
+        sentence="".join(causes[:1]) + sentence(summary),
+        mark="warn" if causes or summary["joined"] < len(summary["sessions"]) else "good",
         sessions=summary["sessions"],
         crispness=crispness(summary),
         **{name: data_address("image/png", p.read_bytes()) if p.is_file() else "" for name, p in pictures.items()},

@@ -431,6 +431,5 @@ def _errors(about: JudgedRun) -> str:
 
 
 def _capital(text: str) -> str:
-    if "_" in text.split(" ", 1)[0]:  # the name of a parameter
-        return text
-    return text[:1].upper() + text[1:]
+    is_name = not text.split(" ", 1)[0].isalpha()  # of a parameter or a file
+    return text if is_name else text[:1].upper() + text[1:]

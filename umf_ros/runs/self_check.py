@@ -28,7 +28,6 @@ from scipy.special import expit
 
 from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import PoseGraphSettings, load_settings
-from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, cubes, evenly, first_of_cubes, invert, transform
 from umf_ros.core.io import write_table
@@ -36,7 +35,7 @@ from umf_ros.pose_graph.closures import Closures, PlacedClosure, as_closures
 from umf_ros.pose_graph.consistency import loops_between, paths_between, squared_mahalanobis
 from umf_ros.pose_graph.sessions import Sessions
 from umf_ros.runs.reader import read_trajectory
-from umf_ros.runs.run_file import NAME, SCAN_UNIT_M, RunFile
+from umf_ros.runs.run_file import SCAN_UNIT_M, RunFile
 from umf_ros.scan._kernels import KdTree
 from umf_ros.sensors.sessions import OdometrySessionSplitter
 
@@ -128,8 +127,6 @@ def check_run(folder: Path) -> SelfCheck:
     Raises:
         UmfError: the folder holds no run, or it is damaged.
     """
-    if not (folder / NAME).is_file():
-        raise UmfError(f"{folder} holds no run: {NAME} is missing")
     settings = load_settings(folder / "config.yaml").pose_graph
     with closing(RunFile(folder, read_only=True)) as file:
         sessions = Sessions(settings, AbsoluteReference(settings))

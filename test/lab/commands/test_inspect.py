@@ -85,9 +85,9 @@ def test_it_says_what_is_there_and_what_that_gives(tmp_path: Path, monkeypatch: 
 @pytest.mark.parametrize(
     ("entries", "said"),
     [
-        (traverse(3.0), "fault: 3.0 s are shorter than loop.min_time_gap_s, 20 s: no match is allowed"),
-        ([e for e in traverse(25.0) if e[0] == LEFT], "fault: no depth: one camera, no scans and no right images"),
-        ([e for e in traverse(25.0) if e[0] == ODOMETRY], "fault: neither images nor scans"),
+        (traverse(3.0), "3.0 s are shorter than loop.min_time_gap_s, 20 s: no match is allowed"),
+        ([e for e in traverse(25.0) if e[0] == LEFT], "no depth: one camera, no scans and no right images"),
+        ([e for e in traverse(25.0) if e[0] == ODOMETRY], "neither images nor scans"),
     ],
 )
 def test_what_could_find_nothing_ends_with_3(
@@ -135,7 +135,7 @@ def test_camera_info_and_transforms_become_the_calibration(tmp_path: Path, monke
         yaml.safe_load((tmp_path / "my_rover.yaml").read_text())["/**"]["ros__parameters"]["topics"]["cloud"] == CLOUD
     )
     line = only_line(umf("inspect", bag, "--write", tmp_path))
-    assert line.endswith("my_rover.yaml is there already: nothing was written")
+    assert line.endswith("my_rover.yaml is there already: nothing was written; move it, or name another folder")
 
 
 def test_an_imu_is_no_odometry_and_what_to_run_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -209,7 +209,7 @@ def test_what_nothing_describes_is_refused_in_one_line(tmp_path: Path, monkeypat
     assert ended.status == 3 and "--set topics.left_image=/front/camera/image_raw" in ended.text
     bare = [entry for entry in vlp_16_and_camera() if entry[0] != "/tf_static"]
     told = only_line(umf("replay", write(tmp_path / "bare.mcap", bare, monkeypatch), "--out", tmp_path / "runs"))
-    assert "without /tf_static its sensors are anywhere; the parameter calibration names a file" in told
+    assert "without /tf_static the mountings of its sensors are unknown; the parameter calibration names a file" in told
     assert not (tmp_path / "runs").exists()
 
 

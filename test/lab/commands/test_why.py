@@ -24,7 +24,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out" / "latest"
 
 
-def test_it_names_the_gate_and_lists_what_was_returned(run: Path) -> None:
+def test_it_names_the_gate_and_lists_what_was_returned(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")  # no cell is cut
     before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
     ended = umf("why", run, "3.5")
     assert ended.status == 0, ended.text
@@ -43,7 +44,10 @@ def test_a_moment_is_a_stamp_or_seconds(run: Path) -> None:
 
 
 def test_what_is_wrong_is_one_line(run: Path, tmp_path: Path) -> None:
-    assert only_line(umf("why", tmp_path, "3")) == f"{tmp_path} holds no finished run: summary.json is missing"
+    for command in ("why", "judge", "report"):
+        assert only_line(umf(command, tmp_path)) == f"{tmp_path} holds no finished run: summary.json is missing"
+        assert only_line(umf(command, run.parent)).endswith(f"holds runs and is none; did you mean {run}?")
+        assert only_line(umf(command, bag := run.parents[1] / "small.mcap")).endswith(f"umf replay {bag} makes one")
     for moment in ("500", str(START_NS - 2 * 10**9)):
         line = only_line(umf("why", run, moment))
         assert line.startswith(

@@ -15,7 +15,8 @@ from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.commands import evaluate
-from umf_ros.lab.evaluation.places import lists_place_sets, read_place_sets, read_truth, score_places
+from umf_ros.lab.commands.evaluate import lists_place_sets
+from umf_ros.lab.evaluation.places import read_place_sets, read_truth, score_places
 
 PLACES = 6
 SHIFT = 2

@@ -224,7 +224,7 @@ def test_every_format_becomes_frames(kind: str, tmp_path: Path) -> None:
     assert all((frame.right is not None) == (kind not in ("tum-rgbd", "nuscenes", *SCANS_ALONE)) for frame in frames)
     assert np.allclose(np.diff([frame.stamp_ns for frame in frames]), 50_000_000 if kind == "euroc" else 10**8)
     inspected = umf("inspect", tmp_path / "made.mcap")
-    assert "no match is allowed" in inspected.text and inspected.text.count("fault") == 1  # half a second is too short
+    assert "no match is allowed" in inspected.text and "fault: " not in inspected.text  # it is the last line
 
 
 @pytest.mark.parametrize("kind", MADE)
@@ -362,7 +362,7 @@ def test_an_imported_recording_is_of_no_known_data_set_and_never_overwritten(tmp
     (tmp_path / "made.mcap").unlink()
     (tmp_path / "made.calibration.yaml").write_text("measured")
     again = only_line(umf("import", "folder", tmp_path / "set", tmp_path / "made.mcap"))
-    assert again.endswith("made.calibration.yaml is there already: nothing was written")
+    assert "made.calibration.yaml is there already: nothing was written" in again
     assert (tmp_path / "made.calibration.yaml").read_text() == "measured"
 
 

@@ -87,15 +87,9 @@ class RecordingOptions:
 
 
 def choose_worlds(name: str, seed: int | None, quick: bool, count: int) -> list[TestWorld]:
-    """Return the first worlds of a name, or those from a seed on.
-
-    Raises:
-        ConfigError: there is no such name.
-    """
+    """Return the first worlds of a name, or those from a seed on."""
     from umf_ros.lab.evaluation.worlds import FIRST_SEEDS, FULL, QUICK, test_worlds
 
-    if name not in FIRST_SEEDS:
-        raise ConfigError(f"--worlds: expected {' or '.join(FIRST_SEEDS)}, not {name!r} (etna: with --methods all)")
     return test_worlds(FIRST_SEEDS[name] if seed is None else seed, QUICK if quick else FULL, count)
 
 
@@ -176,8 +170,6 @@ class EveryMethod:
         from umf_ros.lab.evaluation.bag_run import sequence_set
         from umf_ros.lab.evaluation.retrieval import RULES
 
-        if rule not in RULES:
-            raise ConfigError(f"--rule: expected {' or '.join(RULES)}, not {rule!r}")
         sets = [sequence_set(sequence, RULES[rule]) for sequence in SequenceList(listing).worlds]
         note = (
             f"{listing}: samples with a true match in an earlier pass are asked for it; same place by the rule {rule}."
@@ -188,10 +180,11 @@ class EveryMethod:
         """Evaluate on the keyframes of a recording."""
         from rich.console import Console
 
-        from umf_ros.lab.evaluation.bag_run import recording_set
-
         console = Console()
         opened = options.open(console, None)
+
+        from umf_ros.lab.evaluation.bag_run import recording_set
+
         places = recording_set(options.bag.stem, opened.frames, opened.truth, opened.settings)
         gaps = opened.settings.loop
         note = (
@@ -264,12 +257,10 @@ def command(
     global descriptors alone. On four simulated worlds of different families, a second drive on an offset path under
     another sun queries the first; nothing is trained or tuned on the default seeds of the test worlds.
     """
-    _check(data, worlds, methods, trained)
+    _check(data, worlds, methods, trained, rule)
     listed = data is not None and data.suffix in (".yaml", ".yml")
     if data is not None and not listed:
         check_files(data, config, odometry, ground_truth)
-
-    from umf_ros.lab.evaluation.places import lists_place_sets
 
     of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick, "--count": count != 4}
     of_lists: dict[str, object] = {"--rule": rule != "s3li"}
@@ -287,6 +278,7 @@ def command(
         figures = every.places(data) if every else _on_places(data, parameters(config, changes), embedder, weights, out)
     elif listed:
         refuse_unused("a list of sequences", of_worlds | of_recordings)
+        check_files(Path(), data)
         figures = every.sequences(data, rule) if every else _on_sequences(data, rule, weights, out)
     else:
         refuse_unused("a recording", of_worlds | of_lists | ({"--embedder": embedder} if every else {}))
@@ -302,12 +294,24 @@ def command(
         write_atomically(json_file, json.dumps(figures, indent=2) + "\n")
 
 
-def _check(data: Path | None, worlds: str | None, methods: str, trained: Path | None) -> None:
+def lists_place_sets(listing: Path) -> bool:
+    """Whether a YAML file lists place sets, and not sequences: its first entry names queries."""
+    from umf_ros.core.io import read_yaml
+
+    content = read_yaml(listing) if listing.is_file() else None
+    return isinstance(content, list) and bool(content) and isinstance(content[0], dict) and "queries" in content[0]
+
+
+def _check(data: Path | None, worlds: str | None, methods: str, trained: Path | None, rule: str) -> None:
     """Refuse invalid arguments before the slow imports."""
     if (data is None) == (worlds is None):
         raise ConfigError("expected either a recording or --worlds test|validation")
     if methods not in ("umf", "all"):
         raise ConfigError(f"--methods: expected umf or all, not {methods!r}")
+    if rule not in ("s3li", "robotcar"):
+        raise ConfigError(f"--rule: expected s3li or robotcar, not {rule!r}")
+    if worlds not in (None, "test", "validation", "etna" if methods == "all" else None):
+        raise ConfigError(f"--worlds: expected test or validation, not {worlds!r} (etna: with --methods all)")
     if trained is not None and methods == "umf":
         raise ConfigError("--trained names weights of other methods, and without --methods all there are none")
 
@@ -339,12 +343,13 @@ def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Pa
 def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
+    console = Console()
+    opened = options.open(console, weights)
+
     from umf_ros.core.io import create_run_folder
     from umf_ros.embedding import make_embedder
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
 
-    console = Console()
-    opened = options.open(console, weights)
     settings, bag = opened.settings, options.bag
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, True, settings.verification.features))
     folder = create_run_folder(out, latest=False)
@@ -383,8 +388,6 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     from umf_ros.networks.config import locate_weights
     from umf_ros.networks.weights import load_weights
 
-    if rule not in RULES:
-        raise ConfigError(f"--rule: expected {' or '.join(RULES)}, not {rule!r}")
     console = Console()
     network = load_weights(locate_weights(weights))
     results = validate(network, SequenceList(listing).worlds, rule=RULES[rule])

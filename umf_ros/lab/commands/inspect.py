@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,11 +12,10 @@ from umf_ros.core.errors import OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from umf_ros.bags.reader import Bag
     from umf_ros.lab.evaluation.inspection import Inspected
-
-PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
 
 
 def command(
@@ -38,7 +37,7 @@ def command(
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
-    from umf_ros.commands.console import waiting
+    from umf_ros.commands.console import PLAIN, waiting
     from umf_ros.core.errors import command_line
     from umf_ros.lab.evaluation.inspection import inspect
     from umf_ros.runs.findings import USELESS
@@ -54,7 +53,7 @@ def command(
     given = [*(["--config", config] if config else []), *(word for one in changes or () for word in ("--set", one))]
     _tell(console, bag, recording, found)
     if found.fault:
-        console.print(f"Not usable for loop closure: {found.fault}", style="red", **PLAIN)
+        console.print(f"Not usable for loop closure: {found.fault.line}", style="red", **PLAIN)
         raise typer.Exit(USELESS)
     ready = f"Ready for loop closure: {command_line('replay', bag, *given)}"
     if found.unknown:
@@ -64,10 +63,17 @@ def command(
     console.print(ready, style="green", **PLAIN)
 
 
+def print_table(console: Console, table: Table) -> None:
+    """Print a table; a terminal of fewer than 80 columns breaks its lines, and no cell is cut."""
+    table.width = None if console.width >= 80 else 80
+    console.print(table, crop=False)
+
+
 def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from umf_ros.commands.console import PLAIN
     from umf_ros.core.errors import printable
     from umf_ros.runs.report import COLOURS
     from umf_ros.sensors.topic_finder import describe_inputs
@@ -80,13 +86,13 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
         if topic:
             rate = f"{recording.topics[topic].count / max(recording.duration_s, 1e-9):.1f} Hz"
             table.add_row(name, escape(topic), rate, escape(found.found.get(name, "")))
-    console.print(table)
+    print_table(console, table)
     others = sorted(set(recording.topics) - set(found.topics.model_dump().values()))
     if others:
         console.print(f"not used: {', '.join(others)}", style="dim", **PLAIN)
     if "pairs" in found.found:
         console.print(found.found["pairs"], **PLAIN)
-    for one in found.advice:
+    for one in [one for one in found.advice if one is not found.fault]:
         console.print(f"{one.severity}: {one.line}", style=COLOURS[one.severity], **PLAIN)
     if not found.unknown:
         console.print(describe_inputs(found.settings), **PLAIN)
@@ -95,6 +101,7 @@ def _tell(console: Console, bag: Path, recording: Bag, found: Inspected) -> None
 def _write(console: Console, found: Inspected, recording: Bag, folder: Path) -> Path:
     """Write a parameter file and a calibration; return the path of the former."""
     from umf_ros.bags.frames import read_transforms
+    from umf_ros.commands.console import PLAIN
     from umf_ros.core.errors import writing
     from umf_ros.core.io import write_atomically
     from umf_ros.lab.evaluation.inspection import GUESS, calibration_of_dataset, write_calibration, write_settings

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.commands.recordings import TruthPath, check_files
+from umf_ros.commands.recordings import TruthPath, check_files, check_run
 from umf_ros.core.errors import UmfError, reading
+from umf_ros.lab.commands.inspect import print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,7 +37,7 @@ def command(
     run, nothing is written.
     """
     check_files(bag or Path(), ground_truth)
-    _check_run(folder)
+    check_run(folder)
 
     from rich.console import Console
 
@@ -51,12 +52,6 @@ def command(
             raise UmfError(f"{folder}: its recording is unknown or was moved; name it after the folder")
         opened = open_bag(recording)
     report_run(folder, opened, console, ground_truth)
-
-
-def _check_run(folder: Path) -> None:
-    """Check that a folder holds a run, which may have been killed, before large imports."""
-    if not any((folder / name).is_file() for name in ("summary.json", "run.sqlite")):
-        raise UmfError(f"{folder} holds no finished run: summary.json is missing")
 
 
 def recording_of(folder: Path) -> Path | None:
@@ -112,7 +107,7 @@ def why(
     Also prints the parameter that would accept it, and the effect on other closures. Reads the run folder only. Without
     a stamp, it lists the stages that rejected keyframes, those with most of them first.
     """
-    _check_run(folder)
+    check_run(folder)
     asked = None if moment is None else _moment(moment)
 
     from rich.console import Console
@@ -216,7 +211,7 @@ def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -
             table.add_row(
                 at(one.match_stamp_ns), f"{one.candidate.similarity:.3f}", probability, known, escape(one.outcome)
             )
-        console.print(table)
+        print_table(console, table)
         if others := len(tested) - len(compared):
             say(f"{others} more: {RejectReason.NOT_COMPARED.value}")
     for name, value in sorted(why.contributions.items(), key=lambda one: -abs(one[1]))[:SHOWN]:

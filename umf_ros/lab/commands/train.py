@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from umf_ros.commands.recordings import refuse_unused
+from umf_ros.commands.recordings import check_files, refuse_unused
 from umf_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ def command(
         _follow(recipe, out, workers, seed=seed, threads=threads, workers=workers, device=device)
         return
     assert train is not None
+    check_files(Path(), config, *(Path(one) for one in (train, validation) if one))
     if method == "dbow2":
         machine: dict[str, object] = {"--threads": threads, "--workers": workers, "--device": device}
         refuse_unused("a vocabulary", unused | machine)

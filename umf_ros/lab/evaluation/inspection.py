@@ -64,9 +64,9 @@ class Inspected:
     advice: list[Advice] = field(default_factory=list)
 
     @property
-    def fault(self) -> str:
-        """Why no replay can find anything; empty where one can."""
-        return next((one.what for one in self.advice if one.severity == "fault"), "")
+    def fault(self) -> Advice | None:
+        """Why no replay can find anything; None where one can."""
+        return next((one for one in self.advice if one.severity == "fault"), None)
 
 
 def inspect(bag: Bag, source: ParameterSource = None, for_file: bool = False) -> Inspected:

@@ -103,18 +103,6 @@ def read_place_sets(listing: Path) -> list[PlaceSet]:
     return [_below(listing.parent, one) for one in sets]
 
 
-def lists_place_sets(listing: Path) -> bool:
-    """Whether a YAML file lists place sets, and not sequences: its first entry names queries.
-
-    Raises:
-        ConfigError: the file is not YAML.
-    """
-    if not listing.is_file():
-        return False
-    content = read_yaml(listing)
-    return isinstance(content, list) and bool(content) and isinstance(content[0], dict) and "queries" in content[0]
-
-
 def score_places(
     places: PlaceSet, embedder: Embedder, settings: Verification, report: Callable[[], None] = lambda: None
 ) -> PlaceScores:
