@@ -49,7 +49,7 @@ from umf_ros.verification.measurement import measure, runner_up
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.rerank import rerank
 from umf_ros.verification.scan_alignment import align_scans
-from umf_ros.verification.scan_consistency import ambiguity
+from umf_ros.verification.scan_consistency import ambiguity, excess_differences
 
 RIGHT_M, RIGHT_DEG = 0.3, 2.5
 WRONG_M, WRONG_DEG = 0.75, 4.0  # what lies between is neither
@@ -165,9 +165,9 @@ def _aligned(
     tried: Tried, ranked: Candidate, scans: tuple[PreparedScan, PreparedScan], guess: Array, others: list[Hypothesis]
 ) -> tuple[Array, Measurements]:
     alignment = align_scans(*scans, guess)
-    found = {"pose": alignment.pose, "scans": scans, "alignment": alignment}
-    hypothesis = Hypothesis.of(tried.query, ranked, tried.match, **found)
+    hypothesis = Hypothesis.of(tried.query, ranked, tried.match, pose=alignment.pose, scans=scans, alignment=alignment)
     hypothesis.measurements |= measure(hypothesis) | ambiguity(*scans, alignment.pose, alignment.information)
+    hypothesis.measurements |= excess_differences(*scans, alignment.pose)
     return alignment.pose, hypothesis.measurements | runner_up(hypothesis, others)
 
 
