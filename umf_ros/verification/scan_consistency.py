@@ -15,7 +15,7 @@ from umf_ros.core.geometry import Array, cubes, invert, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import relief_misfit
 from umf_ros.verification.pose_search import alternatives
-from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled, structured
+from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled, structured, submaps
 from umf_ros.verification.scan_alignment import SEARCHED
 from umf_ros.verification.visibility import Sight
 
@@ -78,14 +78,15 @@ def excess_differences(match: PreparedScan, query: PreparedScan, pose: Array) ->
     many times as large the area is where its rays pass them by (a car that left takes a few square metres, goods of
     another aisle differ all along), and the additional share without a counterpart.
 
-    Empty for single scans and for sensors that see little around them, whose submaps show different sides.
+    Empty for single scans, where next to nothing stands, and for sensors that see little around them, whose submaps
+    show different sides.
 
     Args:
         match: the matched submap.
         query: the query's submap.
         pose: (4, 4) `match_T_query`.
     """
-    if match.narrow or query.narrow:
+    if match.narrow or query.narrow or not submaps(match, query):
         return {}
     here = np.eye(4)
     between = np.vstack([_differences(query, match, pose, pose), _differences(match, query, invert(pose), here)])
@@ -95,7 +96,7 @@ def excess_differences(match: PreparedScan, query: PreparedScan, pose: Array) ->
     counts = np.array([np.bincount(cell, minlength=len(metres)) for _, cell in parts])
     passed = np.array([np.bincount(cell, points[:, 3], len(metres)) for points, cell in parts])
     known = counts.min(axis=0) * (counts.min(axis=0) >= const.CELL_POINTS)
-    if known.sum() < const.MIN_SCAN_POINTS:
+    if known.sum() < const.SCANS_COMPARED * const.MIN_SCAN_POINTS:
         return {}
     areas = (passed > const.CELL_PASSED * counts) @ known / known.sum() + const.CELL_PASSED
     missing = between[:, 4].mean() - within[:, 4].mean()
