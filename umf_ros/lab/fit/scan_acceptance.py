@@ -166,8 +166,8 @@ def _aligned(
 ) -> tuple[Array, Measurements]:
     alignment = align_scans(*scans, guess)
     hypothesis = Hypothesis.of(tried.query, ranked, tried.match, pose=alignment.pose, scans=scans, alignment=alignment)
-    hypothesis.measurements |= measure(hypothesis) | ambiguity(*scans, alignment.pose, alignment.information)
-    hypothesis.measurements |= excess_differences(*scans, alignment.pose)
+    found = measure(hypothesis) | ambiguity(*scans, alignment.pose, alignment.information)
+    hypothesis.measurements |= found | excess_differences(*scans, alignment.pose)
     return alignment.pose, hypothesis.measurements | runner_up(hypothesis, others)
 
 
@@ -209,7 +209,6 @@ def _yaw(degrees: float) -> Array:
 EXAMINED = 5  # candidates per query: what retrieval offers first
 EVERY, CONSECUTIVE = 12, 3  # of so many keyframes, the first few are queries
 THRESHOLD = Verification().min_probability
-ACCEPTED_ODDS = math.log(THRESHOLD / (1 - THRESHOLD))
 SURVEYS, PAIRS = range(VALIDATION[0], VALIDATION[0] + 3), 60  # in every domain
 ENOUGH = 100  # right examples that a fit needs
 Survey = tuple[SurveyedDrive, list[Keyframe]]
@@ -278,15 +277,14 @@ def _in_domain(
 def fit(examples: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:
     """The models that explain the examples of scans and of submaps, and how they do in domains left out.
 
-    The shipped model's parts for images stay, and weights of what no example knows, which counts in full there.
+    The shipped model's parts for images stay, and weights of what no example knows, where that counts in full.
     """
     fitted, results = load_acceptance(), dict[str, float]()
     for kind in (SCAN, SUBMAP):
         mine = [example for example in examples if example.kind == kind]
         model, odds = fit_decision(mine, kind, THRESHOLD)
-        new = [
-            name for name, one in CRITERIA[kind].items() if all(math.isnan(one.read(it.measurements)) for it in mine)
-        ]
+        rows = CRITERIA[kind].items()
+        new = [name for name, one in rows if all(one(it.measurements) == one.missing == 1 for it in mine)]
         kept = {name: fitted.models[kind].weights[name] for name in new}
         model = Logistic(model.bias - sum(kept.values()), model.weights | kept)
         bounds = fitted.bounds | {kind: bounds_of(mine, kind)}
@@ -358,7 +356,7 @@ def _sprung_traps() -> list[Example]:
 def _judge(kind: str, examples: list[Example], odds: Array) -> dict[str, float]:
     """Figures of log-odds that every example got without its domain."""
     right, refused = np.array([(example.right, bool(refuted(example.measurements))) for example in examples]).T
-    accepted = (odds >= ACCEPTED_ODDS) & ~refused
+    accepted = (odds >= math.log(THRESHOLD / (1 - THRESHOLD))) & ~refused
     domains = np.array([example.domain for example in examples])
     recall = [float(accepted[right & (domains == name)].mean()) for name in np.unique(domains[right])]
     return {
