@@ -64,6 +64,18 @@ def test_scans_are_joined_by_odometry(trail: SubmapHistory, outing: Drive) -> No
     assert ahead == pytest.approx(moments * SPEED_M_S, abs=0.1)
 
 
+def test_the_scans_of_a_submap_are_kept_whole(trail: SubmapHistory, outing: Drive) -> None:
+    submap = trail.around(28)
+    assert submap is not None and submap.motion is not None
+    times, which = np.unique(submap.motion.moments_s, return_inverse=True)
+    assert len(submap.motion.scans) == len(times)
+    own = int(np.flatnonzero(times == 0)[0])
+    assert submap.motion.scans[own] == pytest.approx(outing.keyframes[28].points, abs=1e-5)
+    for number, points in enumerate(submap.motion.scans):
+        parts = {row.tobytes() for row in submap.points[which == number]}
+        assert parts <= {row.tobytes() for row in points} and len(parts) <= len(points)
+
+
 def test_the_part_of_the_path_between_two_places_is_found(trail: SubmapHistory) -> None:
     path = path_of(trail, trail.rows(0, 10.0, 20.0))
     assert len(path) > 3 and 10.0 <= min(path) < 12.0 and 18.0 < max(path) <= 20.0

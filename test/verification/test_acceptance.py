@@ -103,6 +103,12 @@ def test_missing_numbers_count_as_their_neutral_value(unknown: dict[str, float])
     assert all(found[name] == scores(GOOD)[name] for name in others)
 
 
+def test_submaps_that_differ_more_than_their_scans_do_are_no_closure(shipped: AcceptanceModel) -> None:
+    submaps = GOOD | {"merged": 8.0, "unexplained": 0.08, "upright_counterparts": 0.7}
+    usual, unusual = (shipped.probability(submaps | {"excess_differences": excess}) for excess in (1.2, 1.8))
+    assert unusual < 0.9 < usual == shipped.probability(submaps)
+
+
 def test_rivals_that_were_not_looked_for_speak_for_nothing() -> None:
     found = scores(without(GOOD, *RIVALS))
     assert (found["position_along_known"], found["no_rival"]) == (0.0, 0.0)

@@ -15,7 +15,13 @@ from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import RejectReason
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import inspect
-from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, compare_scans, repetition
+from umf_ros.verification.scan_consistency import (
+    ambiguity,
+    beyond_walls,
+    compare_scans,
+    excess_differences,
+    repetition,
+)
 
 RNG = np.random.default_rng(5)
 UP = make_pose(np.eye(3), [0.0, 0.0, 1.5])  # the sensor on its mast
@@ -190,3 +196,44 @@ def test_rocks_and_trunks_far_apart_are_no_walls() -> None:
     rounded = rocks[:, None] + 0.3 * RNG.standard_normal((60, 30, 3))
     scan = seen(np.concatenate([ground, rounded.reshape(-1, 3)]), np.eye(4))
     assert beyond_walls(scan, scan, np.eye(4)) > 0.5
+
+
+def submap(pillars: Array, x: float = 0.0, count: int = 5, half_deg: float = 180.0) -> PreparedScan:
+    """A hall with these pillars (P, 2) as a submap of scans 1.5 m apart, in the axes of the first; hidden points too.
+
+    A narrow sensor sees so far to either side of what lies ahead.
+    """
+    start = make_pose(np.eye(3), [x, 0.0, 0.0])
+    poses = [make_pose(np.eye(3), [1.5 * number, 0.0, 0.0]) for number in range(count)]
+    worlds = [box((-20, 20), (-7, 7), 3.0, pillars) for _ in poses]
+    own = [seen(world, start @ pose).points for world, pose in zip(worlds, poses, strict=True)]
+    ahead = [points[np.abs(np.degrees(np.arctan2(points[:, 1], points[:, 0]))) < half_deg] for points in own]
+    scans = [PreparedScan(transform(pose, points), pose @ UP) for pose, points in zip(poses, ahead, strict=True)]
+    merged = PreparedScan(
+        np.concatenate([one.points for one in scans]),
+        np.stack([pose @ UP for pose in poses]),
+        owner=np.repeat(np.arange(count), [len(one.points) for one in scans]),
+    )
+    merged.scans = tuple(scans)
+    return merged
+
+
+GOODS = np.stack(np.meshgrid(np.arange(-18.0, 19.0, 2.0), [-4.0, 4.0]), axis=2).reshape(-1, 2)
+SHIFTED = make_pose(np.eye(3), [-0.7, 0.0, 0.0])
+
+
+def excess(pillars: Array) -> float:
+    """Of submaps of two visits, the second with these pillars."""
+    return excess_differences(submap(GOODS), submap(pillars, -0.7), SHIFTED)["excess_differences"]
+
+
+def test_submaps_of_one_place_differ_as_their_scans_do_and_those_of_the_next_aisle_all_along() -> None:
+    worst, best = 1.9, 1.3  # of the criterion
+    assert abs(excess(GOODS)) < 0.3
+    assert excess(GOODS[3:]) < best < worst < excess(GOODS + np.array([0.9, 0.3]))
+
+
+def test_single_scans_and_submaps_of_a_narrow_sensor_show_no_usual_difference() -> None:
+    assert excess_differences(MATCH, QUERY, THERE) == {}
+    ahead = submap(GOODS, half_deg=60.0)
+    assert ahead.narrow and excess_differences(ahead, ahead, np.eye(4)) == {}

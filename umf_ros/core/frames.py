@@ -73,6 +73,7 @@ class ScanMotion:
         removed: whether the motion during each scan was removed; else only that between merged scans was.
         body_T_lidars: (K, 4, 4) poses of the LiDAR at the scans that were merged into one, in order of time;
             empty for a single scan.
+        scans: K times (N, 3) float32 m, all points of these scans, body frame.
     """
 
     moments_s: Points
@@ -80,6 +81,7 @@ class ScanMotion:
     noise: Array
     removed: bool = True
     body_T_lidars: Array = field(default_factory=lambda: np.empty((0, 4, 4)))
+    scans: tuple[Points, ...] = ()
 
     @classmethod
     def none(cls, count: int) -> ScanMotion:

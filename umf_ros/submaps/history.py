@@ -58,7 +58,8 @@ def moved_to(keyframe: Keyframe, other: Keyframe) -> Array:
 def _merged(keyframe: Keyframe, others: Sequence[Keyframe], drift: DriftMeter) -> Keyframe:
     """The keyframe with the points of others where it has none; of those in a cube, of the nearest along the path."""
     scans = [keyframe, *others]
-    points = np.concatenate([moved_to(keyframe, one) for one in scans])
+    clouds = [moved_to(keyframe, one) for one in scans]
+    points = np.concatenate(clouds)
     owner = np.repeat(np.arange(len(scans)), [len(one.points) for one in scans])
     inside = (owner == 0) | (np.einsum("ij,ij->i", points, points) < const.MAX_RANGE_M**2)
     points, owner = points[inside], owner[inside]
@@ -76,6 +77,7 @@ def _merged(keyframe: Keyframe, others: Sequence[Keyframe], drift: DriftMeter) -
         drift.variance(way_m) / lasted_s,
         removed=keyframe.motion is not None,
         body_T_lidars=np.stack([_body_T_other(keyframe, scans[i]) @ scans[i].body_T_lidar for i in taken]),
+        scans=tuple(clouds[i].astype(np.float32) for i in taken),
     )
     return replace(keyframe, points=points[chosen].astype(np.float32), motion=motion)
 

@@ -83,7 +83,8 @@ _OF_SCANS = {
 CRITERIA: dict[str, dict[str, Criterion]] = {
     SCAN: _OF_SCANS,
     # submaps made from two sides share little
-    SUBMAP: {name: criterion for name, criterion in _OF_SCANS.items() if name != "common_view"},
+    SUBMAP: {name: criterion for name, criterion in _OF_SCANS.items() if name != "common_view"}
+    | {"usual_differences": _of("excess_differences", 1.9, 1.3, missing=1.0)},
     IMAGE: {
         "inliers": Criterion(
             lambda known: math.log1p(known.get("inliers_image", 0.0) + known.get("inliers_cloud", 0.0)),

@@ -45,6 +45,7 @@ MEASUREMENTS = {
     "counterparts": "share of these that have a counterpart",
     "upright_counterparts": "of walls, trunks and rocks that should be seen, the share with a counterpart",
     "unexplained": "of the same, the share that is far from everything, the larger of both",
+    "excess_differences": "how much more the scans of two submaps differ from each other than those within each submap",
     "rival_near": "logarithm of how much worse points, or the relief of open ground, fit half a metre on; unknown for "
     "improbable hypotheses",
     "rival_far": "the same of the best fit 1 to 6 m on; 0 when another pose fits as well",

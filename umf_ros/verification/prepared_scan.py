@@ -96,6 +96,7 @@ class PreparedScan:
         points: (M, 3) m, body frame.
         blur_m: how far points may be off because the LiDAR moved during the scan, standard deviation.
         owner: (M,) the merged scan of each point, 0 to K - 1.
+        scans: of K merged scans, each by itself in the same body frame; empty for a single scan.
     """
 
     def __init__(
@@ -114,6 +115,7 @@ class PreparedScan:
         self._lidars_T_body = invert(np.eye(4)[None] if body_T_lidar is None else body_T_lidar.reshape(-1, 4, 4))
         self.owner = np.zeros(len(points), np.intp) if owner is None else owner
         self._maps: dict[float, GridMap] = {}
+        self.scans: tuple[PreparedScan, ...] = ()
 
     @classmethod
     def of(cls, keyframe: Keyframe) -> PreparedScan:
@@ -122,7 +124,10 @@ class PreparedScan:
         blur_m = const.BLUR_M if motion is None or not motion.removed else 0.0
         if motion is None or not len(motion.body_T_lidars):
             return cls(keyframe.points, keyframe.body_T_lidar, blur_m)
-        return cls(keyframe.points, motion.body_T_lidars, blur_m, np.unique(motion.moments_s, return_inverse=True)[1])
+        submap = cls(keyframe.points, motion.body_T_lidars, blur_m, np.unique(motion.moments_s, return_inverse=True)[1])
+        seen = zip(motion.scans, motion.body_T_lidars, strict=True)
+        submap.scans = tuple(cls(points, body_T_lidar, blur_m) for points, body_T_lidar in seen)
+        return submap
 
     @property
     def merged(self) -> int:

@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.geometry import Array, invert, transform
+from umf_ros.core.geometry import Array, cubes, invert, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import relief_misfit
 from umf_ros.verification.pose_search import alternatives
-from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled, structured
+from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled, structured, submaps
 from umf_ros.verification.scan_alignment import SEARCHED
 from umf_ros.verification.visibility import Sight
 
@@ -68,6 +68,59 @@ def _upright(scan: PreparedScan, normals: Array) -> Mask:
 def _share(what: Mask, of: Mask, otherwise: float) -> float:
     count = int(of.sum())
     return float(what[of].sum()) / count if count >= const.FEWEST_POINTS else otherwise
+
+
+def excess_differences(match: PreparedScan, query: PreparedScan, pose: Array) -> dict[str, float]:
+    """Return how much more the scans of two submaps differ from each other than those within each submap.
+
+    How much the submaps of one place differ depends on the sensor and the place; the scans within a submap show it. Of
+    points of walls, trunks and rocks that the nearest scan should see, two numbers are added up: the logarithm of how
+    many times as large the area is where its rays pass them by (a car that left takes a few square metres, goods of
+    another aisle differ all along), and the additional share without a counterpart.
+
+    Empty for single scans, where next to nothing stands, and for sensors that see little around them, whose submaps
+    show different sides.
+
+    Args:
+        match: the matched submap.
+        query: the query's submap.
+        pose: (4, 4) `match_T_query`.
+    """
+    if match.narrow or query.narrow or not submaps(match, query):
+        return {}
+    here = np.eye(4)
+    between = np.vstack([_differences(query, match, pose, pose), _differences(match, query, invert(pose), here)])
+    within = np.vstack([_differences(query, query, here, pose), _differences(match, match, here, here)])
+    metres, cells = np.unique(cubes(np.vstack([between, within])[:, :3], const.MAP_CELL_M[1]), return_inverse=True)
+    parts = (between, cells[: len(between)]), (within, cells[len(between) :])
+    counts = np.array([np.bincount(cell, minlength=len(metres)) for _, cell in parts])
+    passed = np.array([np.bincount(cell, points[:, 3], len(metres)) for points, cell in parts])
+    known = counts.min(axis=0) * (counts.min(axis=0) >= const.CELL_POINTS)
+    if known.sum() < const.SCANS_COMPARED * const.MIN_SCAN_POINTS:
+        return {}
+    areas = (passed > const.CELL_PASSED * counts) @ known / known.sum() + const.CELL_PASSED
+    missing = between[:, 4].mean() - within[:, 4].mean()
+    return {"excess_differences": float(np.log(areas[0] / areas[1]) + const.MISSING_WEIGHT * missing)}
+
+
+def _differences(submap: PreparedScan, other: PreparedScan, other_T_submap: Array, map_T_submap: Array) -> Array:
+    """(N, 5) standing points that the nearest scans of another submap see: x, y, 0 m in a map, passed by, and missing.
+
+    Of the scans that are nearest to a scan of the other; within one submap each is compared with another.
+    """
+    gaps = np.linalg.norm(transform(other_T_submap, submap.lidars)[:, None] - other.lidars, axis=2)
+    if submap is other:
+        np.fill_diagonal(gaps, np.inf)
+    found = [np.empty((0, 5))]
+    for row in np.argsort(gaps.min(axis=1), kind="stable")[: const.SCANS_COMPARED]:
+        if np.isfinite(gaps[row].min()):
+            one, its = ((it.scans or (it,))[i] for it, i in ((submap, row), (other, gaps[row].argmin())))
+            points, spacing = one.sample[stands := _upright(one, one.sample_normals)], one.spacing[stands]
+            _, squared, sight = its.free_space.observe(its.tree, transform(other_T_submap, points))
+            missing = squared >= counterpart_reach(spacing, common_blur(one, its)) ** 2
+            places = transform(map_T_submap, points) * [1.0, 1.0, 0.0]
+            found.append(np.column_stack([places, sight == Sight.PASSED, missing])[sight != Sight.HIDDEN])
+    return np.concatenate(found)
 
 
 def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> dict[str, float]:

@@ -36,7 +36,7 @@ from umf_ros.verification.pose_search import (
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import Alignment, align_scans, inspect
-from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, repetition
+from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, excess_differences, repetition
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 
@@ -200,6 +200,8 @@ class Verifier:
             elif found is not None and not found.undisputed:
                 rivals = []
             one.measurements |= runner_up(one, rivals)
+            if promises:
+                one.measurements |= excess_differences(one.scans[0], one.scans[1], one.pose)
             if earlier:
                 passages.remove(earlier)
                 judged.remove(earlier[0])

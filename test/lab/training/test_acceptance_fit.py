@@ -164,4 +164,7 @@ def test_scans_and_submaps_are_fitted_apart() -> None:
     model, results = fit([replace(one, domain=str(number % 3)) for number, one in enumerate(scans + submaps)])
     assert model.models[SCAN] != model.models[SUBMAP] and model.models[IMAGE] == load_acceptance().models[IMAGE]
     assert "common_view" not in model.models[SUBMAP].weights
+    # no example knows how much the scans within a submap differ: its weight stays
+    kept = load_acceptance().models[SUBMAP].weights["usual_differences"]
+    assert model.models[SUBMAP].weights["usual_differences"] == kept > 0
     assert results["scan_examples"] == results["submap_examples"] == 120
