@@ -247,15 +247,15 @@ def steady(keyframe: Keyframe) -> Keyframe:
     return replace(keyframe, motion=ScanMotion.none(len(keyframe.points)))
 
 
-def test_surfaces_that_do_not_coincide_are_no_closure_however_probable() -> None:
+def test_surfaces_that_do_not_coincide_are_improbable() -> None:
     query, match = (steady(take(GROUND, pose, stamp_s)) for pose, stamp_s in ((HERE, 100.0), (THERE, 10.0)))
     bent = query.points + np.column_stack(
         [np.zeros((len(query.points), 2)), 0.15 * np.sin(1.5 * query.points[:, 0])]
     ).astype(np.float32)
     pair = [candidate(match)]
-    verdict = Verifier(Verification(min_probability=0.0)).verify(replace(query, points=bent), pair)[0]
-    assert verdict.closure is None and verdict.reason is RejectReason.MISFIT
-    assert Verifier(Verification(min_probability=0.0)).verify(query, pair)[0].closure is not None
+    verdict = Verifier(Verification()).verify(replace(query, points=bent), pair)[0]
+    assert verdict.closure is None and verdict.reason is RejectReason.IMPROBABLE
+    assert Verifier(Verification()).verify(query, pair)[0].closure is not None
 
 
 def test_what_is_expected_and_found_needs_no_comparison_of_the_others(verifier: Verifier) -> None:

@@ -55,8 +55,7 @@ class KeypointIndex:
 
     def _keypoints(self, number: int) -> Keypoints:
         descriptors = self._index.descriptors(np.arange(*self._firsts[number : number + 2]))
-        found: Keypoints = np.hstack([self._positions[number], descriptors])
-        return found
+        return np.asarray(np.hstack([self._positions[number], descriptors]))
 
     def _votes(self, query: Keypoints, admissible: NDArray[np.bool_]) -> NDArray[np.float32]:
         """(S,) for every submap: by how much its keypoints are more like the query's than most others'."""
@@ -67,5 +66,4 @@ class KeypointIndex:
             value, found = self._index.nearest(np.ascontiguousarray(query[:, 2:]), kept + 1, known)
             owner = np.searchsorted(self._firsts, found, side="right") - 1
             np.maximum.at(votes, (np.arange(len(votes))[:, None], owner), value - value.min(axis=1, keepdims=True))
-        total: NDArray[np.float32] = votes.sum(axis=0)
-        return total
+        return np.asarray(votes.sum(axis=0))

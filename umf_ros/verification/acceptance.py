@@ -123,9 +123,6 @@ def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
     if kind_of(measurements) == IMAGE:
         repeated = measurements["residual_sigmas"] < const.REPEATED_IMAGE
         return (RejectReason.REPEATED_IMAGE, "") if repeated else None
-    misfit = measurements["residual_m"] / measurements["noise_m"]
-    if misfit > const.MAX_MISFIT:
-        return RejectReason.MISFIT, f"{misfit:.0f} times"
     if measurements.get("lead", math.nan) < 1.0:
         return RejectReason.PASSAGE if _in_passage(measurements) else RejectReason.AMBIGUOUS, ""
     if measurements.get("repetition", math.nan) < const.MIN_REPETITION:

@@ -103,7 +103,6 @@ UNEXPLAINED = 2.0  # measured: in these reaches; of all measures the most alike 
 # 10050 and 10070, after test seed 78 had been seen: of 903 right submaps in eleven domains 5 differ as much as the ten
 # wrong ones of a warehouse
 SCANS_COMPARED, CELL_POINTS, CELL_PASSED, MISSING_WEIGHT = 4, 10, 0.03, 4.0
-MAX_MISFIT = 2.5  # measured: of 2,400 right poses one in 100 has more than 1.5, of wrong ones half have more than this
 
 # ambiguity: would the scans fit as well elsewhere?
 RIVAL_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: beyond the error of a right pose, within a wrong one's

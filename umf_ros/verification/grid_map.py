@@ -70,8 +70,7 @@ class GridMap:
     @cached_property
     def known_relief(self) -> Grid:
         """(C,) relief of the cells with points, NaN where it is unknown."""
-        found: Grid = self.relief[self.rows, self.columns]
-        return found
+        return np.asarray(self.relief[self.rows, self.columns])
 
     @property
     def even(self) -> bool:
@@ -101,8 +100,7 @@ class GridMap:
     def turned_spectra(self, headings: Array, power: int = 1) -> Spectra:
         """Conjugated spectra (H, 2, ...) of the maps or their squares, turned by headings (H,), rad."""
         turned = np.stack([_turned(self.layers, heading) for heading in headings])
-        found: Spectra = _spectra_of(turned**power).conj()
-        return found
+        return np.asarray(_spectra_of(turned**power).conj())
 
 
 def terrain_fit(match: GridMap, query: GridMap, pose: Array) -> tuple[float, float, float]:
@@ -183,8 +181,7 @@ def _blur(values: Grid) -> Grid:
 
 def _spectra_of(layers: Grid) -> Spectra:
     """Spectra (K, 2, ...) of layers (K, side, side, 2)."""
-    found: Spectra = scipy.fft.rfft2(layers.transpose(0, 3, 1, 2))
-    return found
+    return np.asarray(scipy.fft.rfft2(layers.transpose(0, 3, 1, 2)))
 
 
 def _turned(maps: Grid, heading: float) -> Grid:

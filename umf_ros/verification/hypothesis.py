@@ -30,7 +30,6 @@ class RejectReason(Enum):
     NO_DEPTH = "no depth: neither a scan nor a stereo pair"
     NO_POSE = "no pose fits"
     IMPROBABLE = "probability below verification.min_probability"
-    MISFIT = "surfaces are several times their noise apart"
     PASSAGE = "surfaces fit as well elsewhere along the passage"
     AMBIGUOUS = "another pose fits as well"
     WALLS_ALONE = "both scans show the same walls and nothing else, as many places do"

@@ -98,8 +98,7 @@ class PassagePosition(NamedTuple):
         """
         needed = const.PATTERN_SIGMAS if near_identity(self.pose) else const.PASSAGE_SIGMAS
         sigmas = self.sigmas(misfits, known)
-        found: Array = np.minimum((means - self.mean) / const.PASSAGE_LEAD, sigmas / needed)
-        return found
+        return np.asarray(np.minimum((means - self.mean) / const.PASSAGE_LEAD, sigmas / needed))
 
     def sigmas(self, misfits: Array, known: NDArray[np.bool_]) -> Array:
         """(K,) by how many standard deviations rivals fit worse, as metres along the passage vary."""

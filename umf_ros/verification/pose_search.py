@@ -107,8 +107,7 @@ def _found_shares(scan: PreparedScan, points: Array, poses: list[Array], reach_m
         return np.empty(0)
     points, reaches = np.ascontiguousarray(points), np.full(len(points), reach_m)
     misfits = scan.free_space.point_misfits(scan.tree, points, reaches, np.stack(poses), 1.0)
-    shares: Array = (misfits < 1.0).sum(axis=1) / np.maximum(np.isfinite(misfits).sum(axis=1), const.FEWEST_POINTS)
-    return shares
+    return np.asarray((misfits < 1.0).sum(axis=1) / np.maximum(np.isfinite(misfits).sum(axis=1), const.FEWEST_POINTS))
 
 
 def alternatives(match: PreparedScan, query: PreparedScan, pose: Array) -> list[Array]:
@@ -140,8 +139,7 @@ def _correlate(around: Spectra, turned: Spectra, side: int) -> NDArray[np.float3
     products[:, 1] += products[:, 0]
     window = np.arange(-const.MAP_SHIFT, const.MAP_SHIFT + 1)
     rows = scipy.fft.ifft(products, axis=-2)[..., window, :]
-    found: NDArray[np.float32] = scipy.fft.irfft(rows, side, axis=-1)[..., window].swapaxes(0, 1)
-    return found
+    return np.asarray(scipy.fft.irfft(rows, side, axis=-1)[..., window].swapaxes(0, 1))
 
 
 def _peaks(
@@ -173,8 +171,7 @@ def lifted(match: PreparedScan, query: PreparedScan, turn: float, shift: Array) 
     known = offset[np.isfinite(offset)]
     if len(known):
         planar[2, 3] = np.median(known)
-    found: Array = invert(match.upright_T_body) @ planar @ query.upright_T_body
-    return found
+    return np.asarray(invert(match.upright_T_body) @ planar @ query.upright_T_body)
 
 
 def predicted_hypotheses(

@@ -137,8 +137,7 @@ class PreparedScan:
     @cached_property
     def lidars(self) -> Array:
         """(K, 3) m: where the merged scans were taken."""
-        places: Array = invert(self._lidars_T_body)[:, :3, 3]
-        return places
+        return np.asarray(invert(self._lidars_T_body)[:, :3, 3])
 
     @cached_property
     def narrow(self) -> bool:
@@ -174,8 +173,7 @@ class PreparedScan:
     @cached_property
     def upright_points(self) -> Array:
         """(M, 3) m."""
-        turned: Array = self.points @ self.up.T
-        return turned
+        return np.asarray(self.points @ self.up.T)
 
     @cached_property
     def view(self) -> FieldOfView:
@@ -303,8 +301,7 @@ class PreparedScan:
 
 def levelled(match: PreparedScan, query: PreparedScan, pose: Array) -> Array:
     """The pose `match_T_query` (4, 4) between the upright frames of two scans."""
-    found: Array = match.upright_T_body @ pose @ invert(query.upright_T_body)
-    return found
+    return np.asarray(match.upright_T_body @ pose @ invert(query.upright_T_body))
 
 
 def views_decide(match: PreparedScan, query: PreparedScan) -> bool:

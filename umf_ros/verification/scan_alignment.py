@@ -85,14 +85,12 @@ class Alignment:
         if not len(self.residuals):
             return np.empty(0)
         noise = max(1.4826 * float(np.median(np.abs(self.residuals))), const.MIN_NOISE_M)
-        found: Array = 1.0 / (1.0 + (self.residuals / (2 * noise)) ** 2) / noise**2
-        return found
+        return np.asarray(1.0 / (1.0 + (self.residuals / (2 * noise)) ** 2) / noise**2)
 
     @property
     def information(self) -> Array:
         """Information (6, 6) of the residuals."""
-        found: Array = (self.jacobian * self.weights[:, None]).T @ self.jacobian
-        return found
+        return np.asarray((self.jacobian * self.weights[:, None]).T @ self.jacobian)
 
 
 def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Alignment:

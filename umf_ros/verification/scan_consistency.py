@@ -88,8 +88,8 @@ def excess_differences(match: PreparedScan, query: PreparedScan, pose: Array) ->
     """
     if match.narrow or query.narrow or not submaps(match, query):
         return {}
-    here = np.eye(4)
-    between = np.vstack([_differences(query, match, pose, pose), _differences(match, query, invert(pose), here)])
+    here, back = np.eye(4), invert(pose)
+    between = np.vstack([_differences(query, match, pose, pose), _differences(match, query, back, here)])
     within = np.vstack([_differences(query, query, here, pose), _differences(match, match, here, here)])
     metres, cells = np.unique(cubes(np.vstack([between, within])[:, :3], const.MAP_CELL_M[1]), return_inverse=True)
     parts = (between, cells[: len(between)]), (within, cells[len(between) :])
@@ -201,8 +201,7 @@ def beyond_walls(match: PreparedScan, query: PreparedScan, pose: Array) -> float
     """
     if not structured(match, query):
         return np.nan
-    ways = (query, match, pose), (match, query, invert(pose))
-    shares = [_beyond_walls(scan, other, other_T_scan) for scan, other, other_T_scan in ways]
+    shares = _beyond_walls(query, match, pose), _beyond_walls(match, query, invert(pose))
     return float(np.fmin.reduce(shares))
 
 
@@ -213,8 +212,7 @@ def _beyond_walls(scan: PreparedScan, other: PreparedScan, other_T_scan: Array) 
     points, normals = scan.sample[seen], scan.sample_normals[seen]
     if len(points) < const.FEWEST_POINTS:
         return np.nan
-    left = off_walls(points, largest_walls(points, normals))
-    return float(left.mean())
+    return float(off_walls(points, largest_walls(points, normals)).mean())
 
 
 def upright_sample(scan: PreparedScan) -> tuple[Array, Array]:
@@ -247,8 +245,7 @@ def off_walls(points: Array, walls: Array, least_m: float = const.WALL_M) -> Mas
 def _mean_point_misfit(match: PreparedScan, query: PreparedScan, poses: Array, standing: bool = False) -> Array:
     """(K,) mean of both ways of `_point_misfit` at poses (K, 4, 4) `match_T_query`."""
     ways = _point_misfit(match, query, poses, standing), _point_misfit(query, match, invert(poses), standing)
-    mean: Array = np.mean(ways, axis=0)
-    return mean
+    return np.asarray(np.mean(ways, axis=0))
 
 
 def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array, standing: bool = False) -> Array:
@@ -256,17 +253,16 @@ def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array, standin
 
     Of its scouts, and the worst misfit where few are visible; or of all that stand among its sample, and NaN.
     """
-    rows = np.arange(0, len(other.sample), const.SCOUT_EVERY)
-    if standing:
-        rows = np.flatnonzero(_upright(other, other.sample_normals))
+    every = np.arange(0, len(other.sample), const.SCOUT_EVERY)
+    rows = np.flatnonzero(_upright(other, other.sample_normals)) if standing else every
     reach = counterpart_reach(other.spacing[rows], common_blur(scan, other))
     misfit: Array = scan.free_space.point_misfits(scan.tree, other.sample[rows], reach, poses, const.RIVAL_MISFIT)
     if not patterned(scan, other):
         away = _distances_of_others(scan, other, poses, rows)
         misfit = np.where(np.isfinite(misfit) & np.isfinite(away), np.minimum(away / reach, const.RIVAL_MISFIT), np.nan)
     seen = np.isfinite(misfit)
-    otherwise = np.nan if standing else const.RIVAL_MISFIT
-    return mean_misfits(np.where(seen, misfit, 0.0), seen, const.FEWEST_POINTS, otherwise)
+    few = const.FEWEST_POINTS, np.nan if standing else const.RIVAL_MISFIT
+    return mean_misfits(np.where(seen, misfit, 0.0), seen, *few)
 
 
 def _distances_of_others(submap: PreparedScan, other: PreparedScan, poses: Array, rows: NDArray[np.intp]) -> Array:
@@ -284,8 +280,7 @@ def _distances_of_others(submap: PreparedScan, other: PreparedScan, poses: Array
     theirs = submap.owner[index].reshape(len(poses), -1, const.NEIGHBOURS)
     ours = other.owner[other.picks[rows]]
     known = apart[np.arange(len(poses))[:, None, None], ours[None, :, None], theirs]
-    nearest: Array = np.where(known, squared.reshape(known.shape), np.inf).min(axis=2)
-    return np.sqrt(nearest)
+    return np.asarray(np.sqrt(np.where(known, squared.reshape(known.shape), np.inf).min(axis=2)))
 
 
 def mean_misfits(misfits: Array, known: Mask, fewest: float, otherwise: float) -> Array:
@@ -297,8 +292,7 @@ def mean_misfits(misfits: Array, known: Mask, fewest: float, otherwise: float) -
 
 def at_poses(poses: Array, points: Array) -> Array:
     """(K * N, 3) points (N, 3), moved by each of the poses (K, 4, 4)."""
-    moved: Array = points @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
-    return moved.reshape(-1, 3)
+    return np.asarray((points @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3))
 
 
 def shifted(pose: Array, way: Array, shifts: Array) -> Array:

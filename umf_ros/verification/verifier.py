@@ -110,9 +110,8 @@ class Verifier:
         self._memory.remember(query, [(one.keyframes[1], one.pose, self._objection(one) is None) for one in judged])
         found = self._best(query, ranked, judged, {candidate.index for candidate, _ in chosen})
         compared = {candidate.index for candidate, _ in ranked}
-        reason = RejectReason.NOT_COMPARED
-        missing = [(one, match) for one, match in candidates if one.index not in compared]
-        return found + [Hypothesis.of(query, one, match, reason=reason) for one, match in missing]
+        missing = [one for one in candidates if one[0].index not in compared]
+        return found + [Hypothesis.of(query, *one, reason=RejectReason.NOT_COMPARED) for one in missing]
 
     def examine(self, query: Keyframe, candidates: Sequence[Offered]) -> list[Hypothesis]:
         """Return all judged hypotheses about all candidates, without a decision: the examples of the fit."""
@@ -121,9 +120,6 @@ class Verifier:
         first = {one.match_stamp_ns: one for one in reversed(examined)}
         self._memory.remember(query, [(one.keyframes[1], one.pose, False) for one in first.values()])
         return examined
-
-    def _probable(self, hypothesis: Hypothesis) -> bool:
-        return (hypothesis.probability or 0.0) >= self._settings.min_probability
 
     def _rank(self, query: Keyframe, candidates: Sequence[Offered]) -> list[Offered]:
         with self._timed("rerank"):
@@ -359,9 +355,9 @@ class Verifier:
 
     def _objection(self, hypothesis: Hypothesis) -> tuple[RejectReason, str] | None:
         """Why a hypothesis is no closure, with figures; None when it is one."""
-        if not self._probable(hypothesis):
-            below = f"{hypothesis.probability or 0.0:.2f} < {self._settings.min_probability:g}"
-            return RejectReason.IMPROBABLE, below
+        probability, least = hypothesis.probability or 0.0, self._settings.min_probability
+        if probability < least:
+            return RejectReason.IMPROBABLE, f"{probability:.2f} < {least:g}"
         if (reason := refuted(hypothesis.measurements)) is not None:
             return reason
         if strange := self._acceptance.out_of_range(hypothesis.measurements):

@@ -143,8 +143,7 @@ class ViewAlignment:
         if not len(self.residuals):
             return np.zeros((6, 6))
         whole = self._normal / self.spread_sigmas**2
-        found: Array = whole[:6, :6] - np.outer(whole[:6, 6], whole[6, :6]) / (whole[6, 6] + 1.0)
-        return found
+        return np.asarray(whole[:6, :6] - np.outer(whole[:6, 6], whole[6, :6]) / (whole[6, 6] + 1.0))
 
     @property
     def measured_bias_px(self) -> tuple[float, float]:
@@ -318,8 +317,7 @@ def _solve(fit: _Fit) -> tuple[Array, float]:
 
 def _weight(residuals: Array) -> Array:
     """(N,) weights: residuals of many standard deviations count next to nothing (Geman-McClure)."""
-    found: Array = 1.0 / (1.0 + (residuals**2).sum(axis=1) / const.VIEW_GATE) ** 2
-    return found
+    return np.asarray(1.0 / (1.0 + (residuals**2).sum(axis=1) / const.VIEW_GATE) ** 2)
 
 
 def _disparity(camera: StereoCamera, depth: Array) -> Array:

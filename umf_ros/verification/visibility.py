@@ -38,8 +38,7 @@ class FieldOfView:
         shared = np.append(both := np.fft.irfft(spectrum, _SECTORS), both[0])
         steps = np.mod(np.asarray(headings) * (_SECTORS / (2 * np.pi)), _SECTORS)
         narrower = min(self.seen.sum(), other.seen.sum())
-        share: Array = np.interp(steps, np.arange(_SECTORS + 1), shared) / max(narrower, 1.0)
-        return share
+        return np.asarray(np.interp(steps, np.arange(_SECTORS + 1), shared) / max(narrower, 1.0))
 
 
 class Sight(IntEnum):
