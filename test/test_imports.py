@@ -35,7 +35,7 @@ def runtime() -> list[Path]:
 LIGHT = [
     *(f"commands/{name}.py" for name in ("demo", "graph", "compare", "inspect", "report")),
     *(
-        "scan_files.py",
+        *(f"{name}.py" for name in ("scan_files", "imported", "importing", "lidar_sets", "simulation/bag_writer")),
         "datasets/g2o.py",
         "datasets/graph_recording.py",
         "datasets/graph_units.py",
@@ -99,7 +99,7 @@ def test_the_runtime_imports_without_the_lab() -> None:
 
 def test_recordings_are_played_and_graph_files_read_without_the_packages_of_the_lab() -> None:
     names = modules(light())
-    assert len(names) == 15
+    assert len(names) == 19
     used = {name for path in light() for name in imports(path) if name.startswith("umf_ros.lab.")}
     assert used - {"umf_ros.lab.commands"} <= set(names)  # the demo, beside play, simulates first
     statements = [without(lab_packages()), *(f"import {name}" for name in names)]

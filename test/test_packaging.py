@@ -141,7 +141,7 @@ def test_what_is_not_python_is_installed_with_the_package(install: Path) -> None
     ("wing", "lists"),
     [
         ("runtime", ["dependencies", "elevation", "fleet", "rerun", "torch"]),
-        ("lab", ["dependencies", "lab"]),
+        ("lab", ["dependencies", "lab", "las"]),
     ],
 )
 def test_what_is_imported_is_required(wing: str, lists: list[str]) -> None:

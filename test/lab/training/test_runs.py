@@ -320,10 +320,10 @@ def test_training_from_the_command_line(folder, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (["train", "nowhere", "--preset", "tiny"], "not a folder"),
-        (["train", "nowhere", "--loss", "hinge"], "loss: "),
+        (["train", "nowhere", "--preset", "tiny"], "cannot read nowhere"),
+        (["train", "{worlds}", "--loss", "hinge"], "loss: "),
         (["train", "{worlds}", "--preset", "tiny", "--device", "foo"], "device: "),
-        (["train", "nowhere", "--steps", "0"], "steps: "),
+        (["train", "{worlds}", "--steps", "0"], "steps: "),
     ],
 )
 def test_what_cannot_be_trained_is_said_in_one_line(arguments, word, folder, tmp_path):
