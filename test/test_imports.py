@@ -35,7 +35,8 @@ def runtime() -> list[Path]:
 LIGHT = [
     *(f"commands/{name}.py" for name in ("demo", "graph", "compare", "inspect", "report")),
     *(
-        *(f"{name}.py" for name in ("scan_files", "imported", "importing", "lidar_sets", "simulation/bag_writer")),
+        *(f"{name}.py" for name in ("scan_files", "imported", "importing", "lidar_sets")),
+        "simulation/bag_writer.py",
         "datasets/g2o.py",
         "datasets/graph_recording.py",
         "datasets/graph_units.py",

@@ -21,7 +21,6 @@ from umf_ros.bags.reader import message_types
 from umf_ros.core.errors import OutputError, writing
 from umf_ros.core.frames import StereoCamera
 from umf_ros.core.geometry import Array, to_quaternion
-from umf_ros.lab.simulation.lidar import Scan
 
 CLOUD_TYPE = np.dtype(
     [
@@ -123,8 +122,8 @@ def packed_cloud(records: NDArray[Any], stamp_ns: int, is_dense: bool) -> Any:
     )
 
 
-def cloud_message(scan: Scan, stamp_ns: int) -> Any:
-    """sensor_msgs/PointCloud2 of all pulses, those without a return as points at 1 m with intensity 0."""
+def cloud_message(scan: Any, stamp_ns: int) -> Any:
+    """sensor_msgs/PointCloud2 of all pulses of a `lidar.Scan`, those without a return as points at 1 m with intensity 0."""
     records = np.empty(len(scan.points), CLOUD_TYPE)
     records["x"], records["y"], records["z"] = scan.points.T
     records["intensity"], records["ambient_light"] = scan.intensity, scan.ambient
