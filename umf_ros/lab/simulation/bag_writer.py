@@ -123,7 +123,7 @@ def packed_cloud(records: NDArray[Any], stamp_ns: int, is_dense: bool) -> Any:
 
 
 def cloud_message(scan: Any, stamp_ns: int) -> Any:
-    """sensor_msgs/PointCloud2 of all pulses of a `lidar.Scan`, those without a return as points at 1 m with intensity 0."""
+    """sensor_msgs/PointCloud2 of all pulses of a `lidar.Scan`; those without a return: points at 1 m, intensity 0."""
     records = np.empty(len(scan.points), CLOUD_TYPE)
     records["x"], records["y"], records["z"] = scan.points.T
     records["intensity"], records["ambient_light"] = scan.intensity, scan.ambient
