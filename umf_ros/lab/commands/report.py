@@ -90,6 +90,7 @@ def report_run(folder: Path, bag: Bag, console: Console, ground_truth: Path | No
         odometry = read_odometry(named["path"], named["frame"], run.settings)
     with console.status("Checking the sensors"):
         sensors = check_sensors(bag, run.settings, odometry, run.odometry)
+    run.summary["sensors"] = sensors.as_json()  # of the next report too
     return finish_run(run, bag, console, sensors)
 
 
