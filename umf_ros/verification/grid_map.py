@@ -131,8 +131,7 @@ def relief_misfit(match: GridMap, query: GridMap, pose: Array) -> float:
     ours, theirs = _shared_relief(match, query, pose)
     if len(ours) < const.FEWEST_POINTS:
         return 1.0
-    correlation = math.sin(math.pi / 2 * float(np.sign(ours * theirs).mean()))
-    return math.sqrt(1.0 - max(correlation, 0.0) ** 2)
+    return math.sqrt(1.0 - max(math.sin(math.pi / 2 * float(np.sign(ours * theirs).mean())), 0.0) ** 2)
 
 
 def _shared_relief(match: GridMap, query: GridMap, pose: Array) -> tuple[Array, Array]:

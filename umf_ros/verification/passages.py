@@ -154,19 +154,22 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array) -> Passa
     return found._replace(pose=pose if stays else found.pose, lead=lead)
 
 
-def undisputed(found: PassagePosition, match: PreparedScan, query: PreparedScan, pose: Array) -> bool:
+def undisputed(
+    found: PassagePosition, match: PreparedScan, query: PreparedScan, pose: Array, needed: float | None = None
+) -> bool:
     """Whether scans fit worse at all positions along a passage that were compared than at a pose beside them.
 
     Such a pose (4, 4) `match_T_query`, which other measurements found, need not lead by as much as one that this
-    comparison found.
+    comparison found: by `needed` standard deviations, where that is given.
     """
     rivals = found.rivals
     misfits, known = _misfits(match, query, pose[None], _halves(match, query))
     metre = _metres(_halves(match, query), found.way, pose)
     here = found._replace(pose=pose, misfits=misfits[0], known=known[0], metre=metre)
     elsewhere = here.elsewhere
-    needed = const.UNDISPUTED_SIGMAS if known.mean() > const.PASSAGE_KNOWN else 0.0
-    return bool(elsewhere.any() and here.sigmas(rivals.misfits[elsewhere], rivals.known[elsewhere]).min() > needed)
+    usual = const.UNDISPUTED_SIGMAS if known.mean() > const.PASSAGE_KNOWN else 0.0
+    least = usual if needed is None else needed
+    return bool(elsewhere.any() and here.sigmas(rivals.misfits[elsewhere], rivals.known[elsewhere]).min() > least)
 
 
 class FacedPosition(NamedTuple):

@@ -125,8 +125,7 @@ class PreparedScan:
         if motion is None or not len(motion.body_T_lidars):
             return cls(keyframe.points, keyframe.body_T_lidar, blur_m)
         submap = cls(keyframe.points, motion.body_T_lidars, blur_m, np.unique(motion.moments_s, return_inverse=True)[1])
-        seen = zip(motion.scans, motion.body_T_lidars, strict=True)
-        submap.scans = tuple(cls(points, body_T_lidar, blur_m) for points, body_T_lidar in seen)
+        submap.scans = tuple(cls(*one, blur_m) for one in zip(motion.scans, motion.body_T_lidars, strict=True))
         return submap
 
     @property
@@ -259,8 +258,7 @@ class PreparedScan:
         """How far the points scatter about their neighbours' planes, m: sensor noise and roughness together."""
         neighbours, _ = self.tree.neighbours(self.sample, const.NEIGHBOURS)
         offsets = self.points[neighbours[:, 1:]] - self.sample[:, None]
-        away = np.abs(np.einsum("nki,ni->nk", offsets, self.sample_normals))
-        return 1.4826 * float(np.median(away))
+        return 1.4826 * float(np.median(np.abs(np.einsum("nki,ni->nk", offsets, self.sample_normals))))
 
     @cached_property
     def surfaces(self) -> tuple[Surfaces, Surfaces]:
