@@ -328,33 +328,21 @@ def _export_calibration(path: Path) -> tuple[Array, float]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), float(baseline)
 
 
-FORMATS: dict[str, Callable[[Path], Imported]] = {
-    "kitti-odometry": kitti_odometry,
-    "kitti-raw": kitti_raw,
-    "euroc": euroc,
-    "tum-rgbd": tum_rgbd,
-    "nuscenes": nuscenes,
-    "vslam-lab": vslam_lab,
-    "mulran": lidar_sets.mulran,
-    "helipr": lidar_sets.helipr,
-    "nclt": lidar_sets.nclt,
-    "newer-college": lidar_sets.newer_college,
-    "folder": folder,
+Format = tuple[Callable[[Path], Imported], tuple[str, ...]]
+FORMATS: dict[str, Format] = {
+    "kitti-odometry": (kitti_odometry, ("calib.txt", "times.txt")),
+    "kitti-raw": (kitti_raw, ("velodyne_points/timestamps.txt",)),
+    "euroc": (euroc, ("**/cam0/sensor.yaml",)),
+    "tum-rgbd": (tum_rgbd, ("rgb.txt", "depth.txt")),
+    "nuscenes": (nuscenes, ("v1.0-*",)),
+    "vslam-lab": (vslam_lab, ("rgb.csv", "calibration.yaml")),
+    "mulran": (lidar_sets.mulran, ("**/Ouster", "global_pose.csv")),
+    "helipr": (lidar_sets.helipr, ("LiDAR/Ouster",)),
+    "nclt": (lidar_sets.nclt, ("velodyne_sync",)),
+    "newer-college": (lidar_sets.newer_college, ("**/ouster_scan",)),
+    "folder": (folder, ("times.txt",)),
 }
-MARKS = {
-    "kitti-odometry": ("calib.txt", "times.txt"),
-    "kitti-raw": ("velodyne_points/timestamps.txt",),
-    "euroc": ("**/cam0/sensor.yaml",),
-    "tum-rgbd": ("rgb.txt", "depth.txt"),
-    "nuscenes": ("v1.0-*",),
-    "vslam-lab": ("rgb.csv", "calibration.yaml"),
-    "mulran": ("**/Ouster", "global_pose.csv"),
-    "helipr": ("LiDAR/Ouster",),
-    "nclt": ("velodyne_sync",),
-    "newer-college": ("**/ouster_scan",),
-    "folder": ("times.txt",),
-}
-"""Files and folders that a format is recognised by, the more special formats first."""
+"""Function that reads a format, and files and folders that it is recognised by; the more special formats first."""
 
 
 def open_data_set(source: Path) -> DataSetFile:
@@ -364,10 +352,10 @@ def open_data_set(source: Path) -> DataSetFile:
         BagError: it is of no known format, or lacks what a replay needs to know of the sensors.
         SensorFileError: a file cannot be read.
     """
-    kind = next((kind for kind, marks in MARKS.items() if all(any(source.glob(one)) for one in marks)), "")
+    kind = next((kind for kind, (_, marks) in FORMATS.items() if all(any(source.glob(one)) for one in marks)), "")
     if not kind:
         raise BagError(f"{source} is not a recording: it holds neither mcap nor db3 files, nor a known data set")
-    found = FORMATS[kind](source)
+    found = FORMATS[kind][0](source)
     if found.guessed or "raw_camera" in found.camera:
         command = command_line("import", kind, source, f"{source.name}.mcap")
         raise BagError(f"{source} has files of {kind} and needs a calibration, which is written by {command}")

@@ -103,7 +103,7 @@ def read_points(path: Path) -> NDArray[np.float64]:
 
 
 def _read(path: Path, take: Callable[[Columns], Taken], kind: int | Record = 0) -> Taken:
-    """Return what is taken from the columns of a file; `kind` is that of a .bin: its columns of float32, or records."""
+    """Return what `take` makes of the columns of a file; a .bin holds `kind` float32 per point, or such records."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise SensorFileError(f"{path} is no scan: expected {either(SUFFIXES)}")

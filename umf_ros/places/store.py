@@ -287,7 +287,8 @@ def pack(keyframe: Keyframe) -> bytes:
     groups = {group: getattr(embedding, group) for group in FEATURES} | {MOTION: keyframe.motion}
     for group, found in groups.items():
         if found is not None:
-            arrays |= {f"{group}.{item.name}": getattr(found, item.name) for item in fields(found)}
+            # scans are of submaps alone
+            arrays |= {f"{group}.{i.name}": getattr(found, i.name) for i in fields(found) if i.name != "scans"}
     return save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 

@@ -20,6 +20,7 @@ from umf_ros.verification.passages import (
     FacedPosition,
     PassagePosition,
     Position,
+    beaten,
     face_along,
     locate_along,
     stand_out,
@@ -235,11 +236,8 @@ class Verifier:
             return None
         found = found._replace(rival_far=ambiguity(theirs, ours, alignment.pose, alignment.information)["rival_far"])
         planes = locate_along(theirs, ours, alignment.pose) if found.decides else None
-        if planes is not None and planes.known.mean() >= const.STANDING_KNOWN:  # those may tell of a better position
-            # four wrong poses in a tunnel of test seed 82, from which this comes, are beaten by .32 to 1.9 deviations
-            least = -const.UNDISPUTED_SIGMAS / 4
-            return (found, alignment) if undisputed(planes, theirs, ours, alignment.pose, least) else None
-        return (found, alignment) if found.decides else None
+        stands = planes is None or not beaten(planes, theirs, ours, alignment.pose)
+        return (found, alignment) if found.decides and stands else None
 
     def _look_elsewhere(self, hypothesis: Hypothesis, earlier: Position | None) -> Position | None:
         """Compare with other poses; of scans in a passage, move to the best position along it, and return that.

@@ -35,7 +35,7 @@ def command(
     from umf_ros.lab.importing import FORMATS
 
     console = Console()
-    found = FORMATS[kind](source)
+    found = FORMATS[kind][0](source)
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("importing", total=1.0)
         config = write_recording(found, out, lambda done: bar.update(task, completed=done))

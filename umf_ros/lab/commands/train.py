@@ -55,13 +55,15 @@ def command(
         _follow(recipe, out, workers, seed=seed, threads=threads, workers=workers, device=device)
         return
     assert train is not None
+    files = [config, *(Path(one) for one in (train, validation) if one)]
     if method == "dbow2":
         machine: dict[str, object] = {"--threads": threads, "--workers": workers, "--device": device}
         refuse_unused("a vocabulary", unused | machine)
-    check_files(Path(), config, *(Path(one) for one in (train, validation) if one))
-    if method == "dbow2":
+        check_files(Path(), *files)
         _grow_vocabulary(config, train, seed, out)
         return
+    check_files(Path(), *files)
+
     from umf_ros.lab.training.trainer import load_run
 
     chosen: dict[str, object] = {

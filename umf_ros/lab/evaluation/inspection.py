@@ -18,8 +18,9 @@ from umf_ros.bags.reader import Bag, decode
 from umf_ros.core.config import AUTO, ParameterSource, Settings, Topics, load_preset, load_settings
 from umf_ros.core.errors import BagError, MessageError, UmfError, command_line, either, printable
 from umf_ros.core.frames import Frame
-from umf_ros.core.geometry import Array, make_pose, to_quaternion
+from umf_ros.core.geometry import Array, to_quaternion
 from umf_ros.core.trajectory import Trajectory, bracket
+from umf_ros.lab.imported import OPTICAL
 from umf_ros.runs.findings import gap_remedy
 from umf_ros.sensors.calibration import TO_BE_MEASURED, load_calibration
 from umf_ros.sensors.decode import OdometrySample, decode_camera_info, decode_cloud, decode_image, decode_pose, stamp_ns
@@ -34,8 +35,6 @@ FRAMES = 20
 FEW_PAIRS = 0.5
 """Share of the scans with an image, by hand, below which something is wrong."""
 
-OPTICAL = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
-"""`body_T_camera` of a camera that looks ahead, at the origin, in place of a mounting that is unknown."""
 BODIES = ("base_link", "base_footprint", "body", "imu_link")
 GUESS = f"{TO_BE_MEASURED}: a guess"
 RAW = "  # the images look raw: rectify them, or see raw_camera in config/calibration/s3li_vulcano.yaml"

@@ -158,7 +158,7 @@ def _open(one: S3liSequence, folder: Path, notes: list[str]) -> tuple[Any, Setti
     if source is None:
         assert one.export is not None
         source = folder / "export.mcap"
-        config = write_recording(FORMATS["vslam-lab"](one.export), source, lambda done: None)
+        config = write_recording(FORMATS["vslam-lab"][0](one.export), source, lambda done: None)
         recording = open_bag(source)
         settings = settings_for(recording, config, "auto")
     else:
