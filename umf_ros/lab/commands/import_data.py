@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from umf_ros.core.errors import BagError, ConfigError, OutputError, either
+from umf_ros.core.errors import BagError, ConfigError, OutputError, command_line, either
 
 KINDS = "kitti-odometry kitti-raw euroc tum-rgbd nuscenes vslam-lab mulran helipr nclt newer-college folder".split()
 
@@ -44,4 +44,4 @@ def command(
     console.print(f"{out}: {counts}{truth}", markup=False, highlight=False, soft_wrap=True)
     for what in found.guessed:
         console.print(f"a guess that you must replace: {what}", style="yellow", markup=False)
-    console.print(f"next: umf replay {out} --config {config} --odometry YOURS.tum", markup=False, soft_wrap=True)
+    console.print(f"next: {command_line('replay', out, '--config', config)}", markup=False, soft_wrap=True)
