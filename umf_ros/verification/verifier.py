@@ -16,17 +16,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
-from umf_ros.verification.passages import (
-    FacedPosition,
-    PassagePosition,
-    Position,
-    beaten,
-    face_along,
-    locate_along,
-    stand_out,
-    undisputed,
-    was_compared,
-)
+from umf_ros.verification.passages import Position, locate_along
 from umf_ros.verification.pose_search import (
     RotatedMaps,
     TemporalMemory,
@@ -36,7 +26,7 @@ from umf_ros.verification.pose_search import (
 )
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
-from umf_ros.verification.scan_alignment import Alignment, align_scans, inspect
+from umf_ros.verification.scan_alignment import align_scans, inspect
 from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, excess_differences, repetition
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
@@ -187,21 +177,15 @@ class Verifier:
         judged: list[Hypothesis] = []
         passages: list[tuple[Hypothesis, Position]] = []
         for one in aligned:
-            promises, earlier = self._promises(one, least), _along(one, passages)
-            found = self._look_elsewhere(one, earlier[1] if earlier else None) if promises else None
-            if earlier and (found is None or found is earlier[1]):
+            promises = self._promises(one, least)
+            if any(other.candidate is one.candidate and found.compared(one.pose) for other, found in passages):
                 continue
-            rivals = [other for other in aligned if other.candidate is one.candidate]
-            if isinstance(found, FacedPosition):  # those along the passage have been compared
-                rivals = [other for other in rivals if not was_compared(found, other.pose)]
-            elif found is not None and not found.undisputed:
-                rivals = []
+            found = self._look_elsewhere(one) if promises else None
+            # those along the passage have been compared
+            rivals = [] if found else [other for other in aligned if other.candidate is one.candidate]
             one.measurements |= runner_up(one, rivals)
             if promises:
                 one.measurements |= excess_differences(one.scans[0], one.scans[1], one.pose)
-            if earlier:
-                passages.remove(earlier)
-                judged.remove(earlier[0])
             judged.append(one)
             if found:
                 passages.append((one, found))
@@ -222,64 +206,20 @@ class Verifier:
         of_pose = measure(hypothesis) | {"support": self._memory.support(query, match, hypothesis.pose)}
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
-    @staticmethod
-    def _faced(hypothesis: Hypothesis) -> tuple[FacedPosition, Alignment] | None:
-        """The position along a passage that surfaces which face along it decide on, and the alignment there."""
-        (theirs, ours), (query, match), alignment = hypothesis.scans, hypothesis.keyframes, hypothesis.alignment
-        assert isinstance(alignment, Alignment)
-        turned = _is_turned(query, match, alignment.pose)
-        found = face_along(theirs, ours, alignment.pose, turned)
-        if found is not None and found.better is not None:
-            alignment = align_scans(theirs, ours, found.better)
-            found = face_along(theirs, ours, alignment.pose, turned)
-        if found is None or not found._replace(rival_far=np.inf).decides:
-            return None
-        found = found._replace(rival_far=ambiguity(theirs, ours, alignment.pose, alignment.information)["rival_far"])
-        planes = locate_along(theirs, ours, alignment.pose) if found.decides else None
-        stands = planes is None or not beaten(planes, theirs, ours, alignment.pose)
-        return (found, alignment) if found.decides and stands else None
-
-    def _look_elsewhere(self, hypothesis: Hypothesis, earlier: Position | None) -> Position | None:
-        """Compare with other poses; of scans in a passage, move to the best position along it, and return that.
-
-        `earlier` is that of a hypothesis before along the passage. It is returned where it stands for this one too:
-        where it decides, or this one decides no better.
-        """
-        if earlier is not None and earlier.decides:
-            return earlier
+    def _look_elsewhere(self, hypothesis: Hypothesis) -> Position | None:
+        """Compare with other poses; of scans in a passage, move to the best position along it, and return that."""
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
-        if (faced := self._faced(hypothesis)) is not None:
-            position, alignment = faced
-            if alignment is not hypothesis.alignment:
-                hypothesis.pose, hypothesis.alignment = alignment.pose, alignment
-                self._measure(hypothesis)
-            hypothesis.measurements["lead"] = position.lead  # the probability is that of a pose in a passage
-            return position
-        found = earlier or locate_along(theirs, ours, hypothesis.pose)
-        assert not isinstance(found, FacedPosition)  # those decide
-        pose = hypothesis.pose
-        if found is not None and self._stays(found, hypothesis):
-            found = found._replace(pose=pose, undisputed=True)
-        elif earlier is not None:
-            return earlier
-        if found is None or found.undisputed:
+        query, match = hypothesis.keyframes
+        found = locate_along(theirs, ours, hypothesis.pose, _is_turned(query, match, hypothesis.pose))
+        if found is None:
             hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
-            return found
-        hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
-        self._measure(hypothesis)
-        hypothesis.measurements["lead"] = found.lead
+            return None
+        if found.pose is not hypothesis.pose:
+            hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
+            self._measure(hypothesis)
+        hypothesis.measurements["lead"] = found.lead_over([])
         return found
-
-    @staticmethod
-    def _stays(found: PassagePosition, hypothesis: Hypothesis) -> bool:
-        """Whether the pose of a hypothesis holds against all others along a passage."""
-        (theirs, ours), (query, match), pose = hypothesis.scans, hypothesis.keyframes, hypothesis.pose
-        standing = stand_out(theirs, ours, pose)
-        # rows of goods look alike from either end; where planes tell positions, nothing before them overrules these
-        if standing.supports and found.known.mean() < const.STANDING_KNOWN and not _is_turned(query, match, pose):
-            return True
-        return not standing.contradicts and undisputed(found, theirs, ours, pose)
 
     @staticmethod
     def _commonplace(hypothesis: Hypothesis) -> dict[str, float]:
@@ -385,17 +325,8 @@ def _is_turned(query: Keyframe, match: Keyframe, pose: Array) -> bool:
     return abs(float(heading(pose))) > np.pi / 2
 
 
-def _along(hypothesis: Hypothesis, passages: list[tuple[Hypothesis, Position]]) -> tuple[Hypothesis, Position] | None:
-    """Return the hypothesis about the same candidate whose positions along a passage this one's pose is among."""
-    same = (one for one in passages if one[0].candidate is hypothesis.candidate)
-    return next((one for one in same if was_compared(one[1], hypothesis.pose)), None)
-
-
 def _compare_headings(passages: list[tuple[Hypothesis, Position]]) -> None:
-    """Of hypotheses in a passage, count the other heading of the same candidate as a rival."""
+    """Of hypotheses in a passage, count those at another heading of the same candidate as rivals."""
     for one, found in passages:
-        turned = [its for other, its in passages if other is not one and other.candidate is one.candidate]
-        if isinstance(found, FacedPosition):
-            one.measurements["lead"] = found.lead_over([its for its in turned if isinstance(its, FacedPosition)])
-        elif not found.undisputed:
-            one.measurements["lead"] = found.lead_over([its for its in turned if isinstance(its, PassagePosition)])
+        others = [its.pose for other, its in passages if other is not one and other.candidate is one.candidate]
+        one.measurements["lead"] = found.lead_over(others)
