@@ -52,7 +52,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: 
     """Return the pose along a passage at which two scans fit best; None elsewhere, and for submaps.
 
     Poses as far along as scans overlap are compared by some of the points, and the best are aligned. A pose beside the
-    best one stays as it is. There is no evidence for a pose that fits better when it is tilted to either side.
+    best one stays as it is.
 
     Args:
         match: the matched scan.
@@ -78,9 +78,10 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: 
     # about this place the alignment knows better where it is than planes do
     stays = abs((pose[:3, 3] - fits.poses[first, :3, 3]) @ way) <= const.PASSAGE_BESIDE_M
     here, least = pose if stays else fits.poses[first], const.TURNED_EVIDENCE if turned else const.PASSAGE_EVIDENCE
-    if told is None or comparison.fits(np.stack([here, *comparison.tilted(here)])).evidence(0).min() < 0.0:
-        return Position(here, 0.0, least, comparison)
-    return Position(here, float(told.min()), max(least, const.PASSAGE_CONTRAST * float(told.std())), comparison)
+    evidence, differs = (0.0, 0.0) if told is None else (float(told.min()), float(told.std()))
+    if max(match.view.width_deg, query.view.width_deg) < const.FAN_DEG:
+        evidence = min(evidence, comparison.over_tilted(here))
+    return Position(here, evidence, max(least, const.PASSAGE_CONTRAST * differs), comparison)
 
 
 class Comparison:
@@ -121,14 +122,15 @@ class Comparison:
             _means(misfits, known),
         )
 
-    def tilted(self, pose: Array) -> Array:
-        """(K, 4, 4) the pose tilted to either side of the passage, as a wall alone would leave it open."""
+    def over_tilted(self, pose: Array) -> float:
+        """Evidence for a pose (4, 4) over those tilted about the direction across, which one wall leaves open."""
         ours, theirs = self._standing
         placed = [transform(pose, half) for half in ours] + theirs
         middle = np.concatenate([*placed, pose[None, :3, 3]]).mean(axis=0)
         across = np.cross(self._scans[0].up[2], self.way)
         turns = Rotation.from_rotvec(const.TILTS_RAD[:, None] * across / np.linalg.norm(across)).as_matrix()
-        return np.stack([make_pose(turn, middle - turn @ middle) @ pose for turn in turns])
+        tilted = [make_pose(turn, middle - turn @ middle) @ pose for turn in turns]
+        return float(self.fits(np.stack([pose, *tilted])).worse(0)[1:].sum(axis=1).min())
 
     def _of_planes(self, poses: Array, halves: Halves) -> Misfits:
         """Misfits of points of both scans with surfaces of the other, 1 in space that it saw empty."""
@@ -199,12 +201,13 @@ class _Fits(NamedTuple):
     passed: NDArray[np.bool_]
     means: Array
 
-    def evidence(self, number: int) -> Array:
-        """(K,) how much worse points fit at each pose than at one of them.
+    def worse(self, number: int) -> Array:
+        """(K, N) how much worse points fit at each pose than at one of them."""
+        return np.where(self.here[number] & self.there, self.misfits - self.misfits[number], 0.0)
 
-        It has to hold without those in space that was seen empty: what stood there may have moved.
-        """
-        worse = np.where(self.here[number] & self.there, self.misfits - self.misfits[number], 0.0)
+    def evidence(self, number: int) -> Array:
+        """(K,) the sum over the points, or over those alone that no ray passed by, if that is less: others may move."""
+        worse = self.worse(number)
         stayed = np.where(self.passed | self.passed[number], 0.0, worse)
         return np.asarray(np.minimum(worse.sum(axis=1), stayed.sum(axis=1)))
 
@@ -223,8 +226,9 @@ def _best(fits: _Fits, way: Array, count: int) -> tuple[int, Array | None]:
         if not len(elsewhere):
             return first, None
         told = fits.evidence(first)[elsewhere]
-        rival = int(elsewhere[told.argmin()])
-        if told.min() >= 0.0 or rival >= count or rival in tried:
+        better = [(evidence, rival) for evidence, rival in zip(told.tolist(), elsewhere.tolist(), strict=True)]
+        rival = min((one for one in better if one[0] < 0.0 and one[1] < count), default=(0.0, first))[1]
+        if rival in tried:
             return first, told
         first = rival
 

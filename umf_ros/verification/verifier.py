@@ -168,7 +168,7 @@ class Verifier:
 
         The others are only aligned where one of these is promising: the right pose may be among them. The slow tests
         are left out where they cannot change the decision; of the hypotheses along one passage, the first stands for
-        all, or one that is undisputed.
+        all.
         """
         aligned = self._aligned(hypotheses[: const.MAX_REFINED], [])
         promising = [one.candidate for one in aligned if self._promises(one, least)]
