@@ -302,18 +302,14 @@ class Reranking:
 
 
 def word_similarity(queries: Sequence[Keyframe], references: Sequence[Keyframe]) -> Array:
-    """(Q, R) similarity by words of the first references, as in a place database; 0 without an image or too few."""
+    """(Q, R) similarity by words of the first references, as in a place database; 0 where there are none or too few."""
     found = np.zeros((len(queries), len(references)))
     scenes = [one.embedding.scene for one in references]
     if len(known := [scene for scene in scenes if scene is not None]) < FITTED_ON:
         return found
     words = fit_words(known[:FITTED_ON])
     ours, theirs = (
-        {
-            row: code
-            for row, scene in enumerate(each)
-            if scene is not None and (code := words.describe(scene)) is not None
-        }
+        {row: code for row, scene in enumerate(each) if (code := words.describe(scene)) is not None}
         for each in ([one.embedding.scene for one in queries], scenes)
     )
     codes = np.stack(list(theirs.values()))
@@ -323,9 +319,9 @@ def word_similarity(queries: Sequence[Keyframe], references: Sequence[Keyframe])
 
 
 def with_words(similarity: Array, words: Array, queries: Sequence[Keyframe]) -> Array:
-    """(Q, R) both similarities for queries without a scan, the network's for the others: those of a place database."""
-    without_scan = np.array([one.embedding.cloud is None for one in queries])
-    combined: Array = combine(similarity, words * without_scan[:, None])
+    """(Q, R) both similarities for queries of one sensor, the network's for the others: those of a place database."""
+    of_one_sensor = np.array([None in (one.embedding.image, one.embedding.cloud) for one in queries])
+    combined: Array = combine(similarity, words * of_one_sensor[:, None])
     return combined
 
 
