@@ -19,7 +19,7 @@ from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import atomic_write
 from umf_ros.core.limits import read_json
 from umf_ros.places.store import KeyframeStore, index_path
-from umf_ros.places.words import FITTED_ON, Code, fit_words
+from umf_ros.places.words import FITTED_ON, Code, fit_words, worth
 
 logger = logging.getLogger(__name__)
 
@@ -214,11 +214,11 @@ class PlaceDatabase:
     def _compare_words(self, keyframe: Keyframe, rows: Rows) -> Points:
         """Return similarities (R,) of places by the words; 0 without words, or for keyframes of both sensors."""
         similarity = np.zeros(len(rows), np.float32)
-        if self.words is None or not len(rows) or None not in (keyframe.embedding.image, keyframe.embedding.cloud):
+        if self.words is None or not len(rows) or not (share := worth(keyframe.embedding)):
             return similarity
         if (code := self._describe(keyframe)) is not None:
-            known, codes = self.store.codes(rows, self.words.code_bytes)
-            similarity[known] = self.words.compare(code, codes)
+            known, codes = self.store.codes(rows, len(code))
+            similarity[known] = share * self.words.compare(code, codes)
         return similarity
 
     def _open_index(self, dimension: int) -> PlaceIndex:

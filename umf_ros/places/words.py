@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.frames import Points
+from umf_ros.core.frames import Embedding, Points
 
 WORDS = 64
 """Words of a vocabulary (*measured*: 32 give the same recall within one query, 128 less)."""
@@ -18,6 +18,8 @@ FITTED_ON = 40
 """Keyframes that the words are fitted to (*measured*: 80, or all, move recall by less than a point)."""
 ROUNDS = 15
 """Rounds of k-means (*by hand*: the assignments no longer change recall after ten)."""
+SCAN_SHARE = 0.46
+"""Worth of the words of scans, as a share of that of images (*fitted*: weights 0.25 and 0.54; training.md)."""
 SERIAL_ROWS = 32
 """Local vectors per product: OpenBLAS computes such a product on one thread, always in the same order."""
 SEED = 0
@@ -46,11 +48,6 @@ class Words:
         """Hash of the words: codes of other words cannot be compared."""
         return hashlib.sha256(np.ascontiguousarray(self.centres, "<f4").tobytes()).hexdigest()[:8]
 
-    @property
-    def code_bytes(self) -> int:
-        """Bytes of a code."""
-        return WORDS // 8 + WORDS * -(-self.centres.shape[1] // 8)
-
     def describe(self, scene: Scene | None) -> Code | None:
         """Return the code of local vectors; None if there are none, or they are of another trunk or sensor."""
         if scene is None or scene.ndim != 2 or scene.shape[1] != self.centres.shape[1]:
@@ -71,8 +68,12 @@ class Words:
         bits = _BITS[codes[:, head:] ^ query[head:]]
         different = bits.reshape(len(codes), WORDS, bits.shape[1] // WORDS).sum(axis=2)
         products = ((dimension - 2 * different) * (occurs & other)).sum(axis=1)
-        norm = np.sqrt(np.maximum(occurs.sum() * other.sum(axis=1), 1)) * dimension
-        return (products / norm).astype(np.float32)
+        return (products / (np.sqrt(np.maximum(occurs.sum() * other.sum(axis=1), 1)) * dimension)).astype(np.float32)
+
+
+def worth(embedding: Embedding) -> float:
+    """Return the share of the similarity by words that counts: all for an image alone, nothing for both sensors."""
+    return 1.0 if embedding.cloud is None else SCAN_SHARE * (embedding.image is None)
 
 
 def fit_words(scenes: Sequence[Scene | None]) -> Words:

@@ -15,7 +15,7 @@ from umf_ros.core.geometry import Array
 from umf_ros.embedding import Embedder
 from umf_ros.lab.datasets.sample import Rule, distances, label, places_of
 from umf_ros.places.database import is_past
-from umf_ros.places.words import FITTED_ON, fit_words
+from umf_ros.places.words import FITTED_ON, fit_words, worth
 from umf_ros.verification.rerank import Counter, Counts, count_inliers, mutual_neighbours, rerank, similarities
 
 THESIS_RULE = Rule(positive_m=12.0, positive_deg=30.0, negative_m=60.0, negative_deg=30.0)
@@ -320,8 +320,7 @@ def word_similarity(queries: Sequence[Keyframe], references: Sequence[Keyframe])
 
 def with_words(similarity: Array, words: Array, queries: Sequence[Keyframe]) -> Array:
     """(Q, R) both similarities for queries of one sensor, the network's for the others: those of a place database."""
-    of_one_sensor = np.array([None in (one.embedding.image, one.embedding.cloud) for one in queries])
-    combined: Array = combine(similarity, words * of_one_sensor[:, None])
+    combined: Array = combine(similarity, words * np.array([[worth(one.embedding)] for one in queries]))
     return combined
 
 
