@@ -13,13 +13,14 @@ import torch
 from sources import run
 from tiny_worlds import TINY, some_scan
 
-from umf_ros.core.config import EmbeddingSettings
-from umf_ros.core.errors import ConfigError, WeightsError
+from umf_ros.core.config import Database, EmbeddingSettings
+from umf_ros.core.errors import ConfigError, UmfError, WeightsError
 from umf_ros.core.resources import find
 from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.inputs import pack, prepare_scan, standardise
 from umf_ros.embedding.runtimes import (
     OUTPUTS,
+    SCAN_TOKENS,
     SCENE_MAP,
     SUPERS,
     OpenVinoRuntime,
@@ -34,6 +35,7 @@ from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.config import XFEAT_OUTPUTS, locate_weights, read_config
 from umf_ros.networks.umf import UMF
 from umf_ros.networks.weights import load_weights
+from umf_ros.places.database import PlaceDatabase
 
 XFEAT = find("models/xfeat.safetensors")
 IMAGE = np.random.default_rng(0).uniform(0, 255, (1, 1, 64, 96)).astype(np.float32)
@@ -91,20 +93,22 @@ def test_half_precision_of_a_gpu_changes_descriptors_little():
         assert name_outputs(weights, runtime) == name.replace("-", "-float16-")
 
 
-def test_the_map_of_the_trunk_comes_with_the_descriptor_in_eight_bits_as_well():
-    """The shipped model was exported without this output."""
+def test_the_map_of_the_trunk_and_tokens_of_the_scan_come_with_the_descriptor_in_eight_bits_as_well():
+    """The shipped model was exported without these outputs."""
     weights = locate_weights(None)
     config = read_config(weights)
     rows, columns = np.indices(config.image_size)
     image = standardise((128 + 60 * np.sin(rows / 9) + 60 * np.sin(rows * columns / 4000)).astype(np.uint8))
-    umf = pack([image], [prepare_scan(some_scan(0), None, config)], config)
-    quantised, single = (
-        make_runtime(weights, settings(runtime), ("descriptor", SCENE_MAP)).run(umf) for runtime in ("auto", "torch")
-    )
-    assert set(quantised) == set(single) == {"descriptor", SCENE_MAP}
+    scan, names = prepare_scan(some_scan(0), None, config), ("descriptor", SCENE_MAP, SCAN_TOKENS)
+    umf = pack([image], [scan], config)
+    quantised, single = (make_runtime(weights, settings(runtime), names).run(umf) for runtime in ("auto", "torch"))
+    assert set(quantised) == set(single) == set(names)
     assert quantised[SCENE_MAP].shape == (112, *(side // 16 for side in config.image_size))
-    ours, theirs = (found[SCENE_MAP] / np.linalg.norm(found[SCENE_MAP], axis=0) for found in (quantised, single))
-    assert np.median((ours * theirs).sum(axis=0)) > 0.9
+    for found in (quantised, single):
+        found[SCAN_TOKENS] = found[SCAN_TOKENS][scan.coarse_mask].T
+    for name in names[1:]:
+        ours, theirs = (found[name] / np.linalg.norm(found[name], axis=0) for found in (quantised, single))
+        assert np.median((ours * theirs).sum(axis=0)) > 0.9
     without = make_runtime(weights, settings(), ("descriptor",)).run(umf)
     np.testing.assert_array_equal(without["descriptor"], quantised["descriptor"])
 
@@ -139,9 +143,7 @@ def test_without_torch_one_line_names_the_package(monkeypatch, copy):
 
 
 def test_without_openvino_torch_runs_the_same_weights(monkeypatch):
-    from umf_ros.embedding import runtimes
-
-    monkeypatch.setattr(runtimes, "find_spec", lambda name: None)
+    monkeypatch.setattr("umf_ros.embedding.runtimes.find_spec", lambda name: None)
     assert isinstance(xfeat(XFEAT), TorchRuntime)
     with pytest.raises(ConfigError, match="it is not installed"):
         xfeat(XFEAT, "openvino")
@@ -181,10 +183,6 @@ def test_the_name_tells_precisions_apart(copy):
 
 
 def test_a_store_of_another_precision_is_refused_in_one_line(tmp_path):
-    from umf_ros.core.config import Database
-    from umf_ros.core.errors import UmfError
-    from umf_ros.places.database import PlaceDatabase
-
     plain, fast = (name_outputs(XFEAT, xfeat(XFEAT, name)) for name in ("torch", "openvino"))
     PlaceDatabase(Database(path=str(tmp_path / "places.db")), plain, 64).close()
     with pytest.raises(UmfError, match=f"places.db was made with embedder {plain}, not {fast}$"):
@@ -266,9 +264,7 @@ def test_concurrent_inference_does_not_deadlock():
 
 
 def test_a_network_that_cannot_run_is_refused_at_the_start(monkeypatch):
-    from umf_ros.embedding import runtimes
-
-    monkeypatch.setattr(runtimes, "XFEAT_SHAPE", (1, 3, 384, 512))  # three channels
+    monkeypatch.setattr("umf_ros.embedding.runtimes.XFEAT_SHAPE", (1, 3, 384, 512))  # three channels
     with pytest.raises(WeightsError, match=r"xfeat.safetensors cannot be run: ."):
         xfeat(XFEAT, "openvino")
 

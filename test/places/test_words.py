@@ -15,8 +15,8 @@ from umf_ros.core.config import Database, Loop
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import WORDS_WEIGHT, Candidate, Keyframe
 from umf_ros.places.database import PlaceDatabase
-from umf_ros.places.store import delete_sessions, pack, unpack
-from umf_ros.places.words import FITTED_ON, WORDS, fit_words
+from umf_ros.places.store import delete_sessions
+from umf_ros.places.words import FITTED_ON, SCAN_SHARE, WORDS, fit_words
 
 RULES = Loop(min_similarity=-1, min_time_gap_s=20, min_travel_m=15, top_k=20)
 CHANNELS, CELLS = 12, 60
@@ -54,12 +54,21 @@ def query_of(place: int, scan: bool = False) -> Keyframe:
     return keyframe_of(place, 1000, scan, scene_of(place, noise=0.1, seed=1))
 
 
+def scan_alone(keyframe: Keyframe) -> Keyframe:
+    """The keyframe as a LiDAR sees it: local vectors of another length, and features of the scan."""
+    scene, features = np.tile(np.asarray(keyframe.embedding.scene), 2), keyframe.embedding.image
+    return replace(keyframe, embedding=replace(keyframe.embedding, scene=scene, image=None, cloud=features))
+
+
 def found_by(places: PlaceDatabase, query: Keyframe) -> list[Candidate]:
     return places.query(query, RULES)
 
 
 def test_places_before_and_after_the_fit_are_told_apart_by_words() -> None:
-    with closing(filled()) as places:
+    with closing(filled(count=FITTED_ON - 1)) as places:
+        assert places.words is None and {one.words for one in found_by(places, query_of(5))} == {0.0}
+        for place in range(FITTED_ON - 1, FITTED_ON + 3):
+            places.add(keyframe_of(place, place))
         for place in (0, FITTED_ON - 1, FITTED_ON + 2):
             best = found_by(places, query_of(place))[0]
             assert best.index == place
@@ -68,16 +77,19 @@ def test_places_before_and_after_the_fit_are_told_apart_by_words() -> None:
 
 
 def test_words_do_not_count_for_keyframes_with_a_scan_or_without_an_image() -> None:
+    blind = replace(query_of(5), embedding=replace(query_of(5).embedding, scene=None))
     with closing(filled()) as places:
-        blind = query_of(5)
-        blind = replace(blind, embedding=replace(blind.embedding, scene=None))
         for query in (query_of(5, scan=True), blind):
             assert [(one.index, one.words) for one in found_by(places, query)] == [(row, 0.0) for row in range(20)]
 
 
-def test_before_there_are_enough_images_the_network_decides_alone() -> None:
-    with closing(filled(count=FITTED_ON - 1)) as places:
-        assert places.words is None
+def test_scans_alone_have_words_of_their_own_and_keyframes_of_another_sensor_none_of_them() -> None:
+    with closing(opened()) as places:
+        for place in range(FITTED_ON):
+            places.add(scan_alone(keyframe_of(place, place)) if place % 4 else keyframe_of(place, place))
+        assert places.words is not None and places.words.centres.shape == (WORDS, 2 * CHANNELS)
+        best = {one.index: one.words for one in found_by(places, scan_alone(query_of(5)))[:1]}
+        assert best == {5: pytest.approx(0.8 * SCAN_SHARE, rel=0.25)}
         assert {one.words for one in found_by(places, query_of(5))} == {0.0}
 
 
@@ -121,8 +133,7 @@ def test_a_file_of_the_release_before_is_read_as_it_is_and_converted_when_it_is_
     path = tmp_path / "places.sqlite"
     old = opened(path)
     for place in range(20):
-        known = keyframe_of(place, place)
-        old.add(replace(known, embedding=replace(known.embedding, scene=None)))
+        old.add(replace(keyframe_of(place, place), embedding=replace(keyframe_of(place, 0).embedding, scene=None)))
     old.close()
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.executescript("DROP TABLE words; DROP TABLE code;")
@@ -144,15 +155,10 @@ def test_words_that_were_changed_in_the_file_are_refused(tmp_path: Path) -> None
         opened(path)
 
 
-def test_local_vectors_survive_packing() -> None:
-    known = keyframe_of(3, 3)
-    np.testing.assert_array_equal(unpack(pack(known)).embedding.scene, known.embedding.scene)
-
-
 def test_codes_of_an_image_are_most_similar_to_themselves_and_vectors_of_another_trunk_have_none() -> None:
     words = fit_words([scene_of(place) for place in range(FITTED_ON)])
     codes = np.stack([words.describe(scene_of(place)) for place in range(20)])
-    assert codes.shape == (20, words.code_bytes) == (20, WORDS // 8 + 2 * WORDS)
+    assert codes.shape == (20, WORDS // 8 + 2 * WORDS)
     similarity = np.stack([words.compare(code, codes) for code in codes])
     np.testing.assert_array_equal(similarity, similarity.T)
     np.testing.assert_allclose(np.diag(similarity), 1, atol=1e-6)

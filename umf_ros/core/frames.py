@@ -156,7 +156,8 @@ class Embedding:
     """The network's description of one frame: a global descriptor and the features of each modality that it has.
 
     The descriptor is (D,) float32, L2-normalised; similarity is the dot product. The scene is (N, C) int8, the
-    directions of the cells of the image trunk's deepest map, for `umf_ros.places.words`.
+    directions of the cells of the image trunk's deepest map, or without an image of the tokens of the scan, for
+    `umf_ros.places.words`.
     """
 
     descriptor: NDArray[np.float32]

@@ -33,6 +33,8 @@ OUTPUTS = ("descriptor", "image_local", "image_saliency", "cloud_local", "cloud_
 """Distinct from the names of inputs: OpenVINO renames a tensor whose name is taken."""
 SCENE_MAP = "scene_map"
 """Deepest map (C, H / 16, W / 16) of the scene descriptor's trunk, of a network that has one."""
+SCAN_TOKENS = "scan_tokens"
+"""Tokens (T, C) of the occupied cells of a scan, before the fusion and without their positions."""
 SUPERS = ("super_image", "super_image_strength", "super_cloud", "super_cloud_strength")
 MODEL_SUFFIX = ".openvino"
 """Suffix of the zip archive of `model.xml` and `model.bin` beside a weights file."""
@@ -63,8 +65,7 @@ class OpenVinoRuntime:
         with reading(path, WeightsError, "is damaged"):
             with open_archive(path) as archive:
                 model = openvino_core().read_model(archive.read("model.xml"), archive.read("model.bin"))
-            if SCENE_MAP in outputs:
-                _expose_scene_map(model)
+            _expose(model, {SCENE_MAP, SCAN_TOKENS} & set(outputs))
             self.precision, made_from = (model.get_rt_info([FACTS, name]).value for name in ("precision", "weights"))
         if made_from != hashlib.sha256(weights.read_bytes()).hexdigest():
             raise WeightsError(f"{path} was made from other weights; delete it, or make it again with umf export")
@@ -128,8 +129,7 @@ class TorchRuntime:
         half = self._torch.autocast(self._device.type, self._torch.float16, enabled=self.precision == "float16")
         with self._torch.inference_mode(), half:
             found = self._network(*(self._torch.from_numpy(array).to(self._device) for array in inputs))
-        values = (value[0].float().cpu().numpy() for value in found)
-        return dict(zip(self._outputs, values, strict=True))
+        return {name: value[0].float().cpu().numpy() for name, value in zip(self._outputs, found, strict=True)}
 
 
 Runtime = OpenVinoRuntime | TorchRuntime
@@ -205,14 +205,15 @@ def openvino_core() -> Any:
     return import_openvino().Core()
 
 
-def _expose_scene_map(model: Any) -> None:
-    """Make the map that the scene descriptor is pooled from an output of a model that was exported without it."""
-    if any(SCENE_MAP in port.get_names() for port in model.outputs):
-        return
-    pooling = next(op for op in model.get_ops() if op.get_type_name() == "AdaptiveAvgPool")
-    source = pooling.input_value(0)
-    source.get_tensor().set_names({SCENE_MAP})
-    model.add_outputs(source)
+def _expose(model: Any, names: set[str]) -> None:
+    """Make the scene map, and the tokens of the scan, outputs of a model that was exported without them."""
+    for op in model.get_ops():
+        pools = op.get_type_name() == "AdaptiveAvgPool"
+        if pools or op.get_friendly_name().endswith(".cloud_tokens/aten::layer_norm/Add"):
+            name, source = (SCENE_MAP, op.input_value(0)) if pools else (SCAN_TOKENS, op.output(0))
+            if name in names and not any(name in port.get_names() for port in model.outputs):
+                source.get_tensor().set_names({name})
+                model.add_outputs(source)
 
 
 def _cache_options() -> dict[str, str]:

@@ -13,7 +13,7 @@ from umf_ros.core.geometry import Array, invert, transform
 from umf_ros.core.levelling import level
 from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.inputs import VoxelScan, is_blank, pack, prepare_image, prepare_scan
-from umf_ros.embedding.runtimes import SCENE_MAP, Outputs, make_runtime, name_outputs, outputs_of
+from umf_ros.embedding.runtimes import SCAN_TOKENS, SCENE_MAP, Outputs, make_runtime, name_outputs, outputs_of
 from umf_ros.networks.config import locate_weights, read_config
 
 KEYPOINTS = 400
@@ -59,9 +59,9 @@ def ground_regions(points: Points, side_m: float = 4.0) -> NDArray[np.int64]:
     return cell[:, 0] * 10000 + cell[:, 1]
 
 
-def local_vectors(scene_map: Points) -> NDArray[np.int8]:
-    """Return the directions (H * W, C) of the cells of a map (C, H, W), each scaled to 127 at its largest component."""
-    cells = scene_map.reshape(len(scene_map), -1).T
+def local_vectors(cells: Points) -> NDArray[np.int8]:
+    """Return the directions (N, C) of cells (C, ...), each scaled to 127 at its largest component."""
+    cells = cells.reshape(len(cells), -1).T
     largest = np.maximum(np.abs(cells).max(axis=1, keepdims=True), np.float32(1e-9))
     return np.rint(cells * (127 / largest)).astype(np.int8)
 
@@ -92,7 +92,7 @@ class UmfEmbedder:
         self._asked = asked
         rows, columns = (side // 4 for side in self._config.image_size)
         self._regions = cell_regions(rows, columns)
-        outputs = outputs_of(asked) + ((SCENE_MAP,) if self._config.scene else ())
+        outputs = outputs_of(asked) + (SCAN_TOKENS,) + ((SCENE_MAP,) if self._config.scene else ())
         self._runtime = make_runtime(path, settings, outputs)
         self.name = name_outputs(path, self._runtime, PREPROCESSING)
 
@@ -104,13 +104,14 @@ class UmfEmbedder:
         scan = prepare_scan(points, frame.intensity, self._config)
         found = self._runtime.run(pack([prepare_image(image, self._config)], [scan], self._config))
         supers = self._supers(found) if self._asked.supers else (None, None)
+        cells = found.get(SCENE_MAP) if image is not None else found[SCAN_TOKENS][scan.coarse_mask].T
         return Embedding(
             descriptor=found["descriptor"],
             image=self._image_features(found, image.shape[:2]) if self._asked.image and image is not None else None,
             cloud=self._cloud_features(found, scan, level_T_body) if scan.fine_mask.any() else None,
             super_image=None if image is None else supers[0],
             super_cloud=supers[1] if scan.fine_mask.any() else None,
-            scene=None if image is None or SCENE_MAP not in found else local_vectors(found[SCENE_MAP]),
+            scene=None if cells is None or not cells.size else local_vectors(cells),
         )
 
     def _image_features(self, found: Outputs, shape: tuple[int, int]) -> LocalFeatures:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -50,12 +51,14 @@ class NetworkOutput:
         descriptor: (B, D) float32, L2-normalised.
         image, cloud: local features.
         super_image, super_cloud: super-features, on request.
+        scan_tokens: (B, T, C), tokens of the scan before fusion, without their positions.
         scene_map: (B, C, H/16, W/16), deepest map of the scene descriptor's trunk; None without this part.
     """
 
     descriptor: Tensor
     image: LocalMap
     cloud: LocalMap
+    scan_tokens: Tensor
     super_image: SuperMap | None = None
     super_cloud: SuperMap | None = None
     scene_map: Tensor | None = None
@@ -131,7 +134,8 @@ class UMF(nn.Module):
         supers: tuple[SuperMap | None, SuperMap | None] = (None, None)
         if super_features:
             supers = self.super_image(image.tokens, image.mask), self.super_cloud(cloud.tokens, cloud.mask)
-        return NetworkOutput(fused.descriptor, image, cloud, *supers, scene_map=features.scene_map)
+        scan_tokens = features.cloud.values - self.coarse_voxels(batch.coarse_index)
+        return NetworkOutput(fused.descriptor, image, cloud, scan_tokens, *supers, scene_map=features.scene_map)
 
 
 class FlatUmf(nn.Module):
@@ -150,15 +154,15 @@ class FlatUmf(nn.Module):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Map the fields of `NetworkInput`, in their order, to the outputs."""
         found: NetworkOutput = self.network(NetworkInput(*inputs), super_features="super_image" in self.outputs)
-        named: dict[str, Tensor] = {
+        named: dict[str, Any] = {
             "descriptor": found.descriptor,
             "image_local": found.image.descriptors,
             "image_saliency": found.image.saliency,
             "cloud_local": found.cloud.descriptors,
             "cloud_saliency": found.cloud.saliency,
+            "scan_tokens": found.scan_tokens,
+            "scene_map": found.scene_map,
         }
-        if found.scene_map is not None:
-            named["scene_map"] = found.scene_map
         for name in ("super_image", "super_cloud"):
             supers = getattr(found, name)
             if supers is not None:

@@ -19,7 +19,7 @@ from umf_ros.core.geometry import Array, evenly
 from umf_ros.core.io import atomic_write
 from umf_ros.core.limits import read_json
 from umf_ros.places.store import KeyframeStore, index_path
-from umf_ros.places.words import FITTED_ON, Code, fit_words
+from umf_ros.places.words import FITTED_ON, Code, fit_words, worth
 
 logger = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ class PlaceDatabase:
 
     Attributes:
         listed: sessions that the map of these places lists; None where they are of no map.
-        words: fitted to the first images of the database and kept from then on; None before.
+        words: fitted to the first keyframes of the database and kept from then on; None before.
 
     Raises:
         UmfError: the file is no place database, belongs to another embedder, or is in use.
@@ -162,8 +162,8 @@ class PlaceDatabase:
         """Return the most similar earlier places, best first.
 
         Keyframes must lie far enough back, by `is_past`. A place of many sessions does not displace the others.
-        A keyframe without a scan is compared by the words, too (*measured*: of keyframes with both, the words of
-        images add nothing to the descriptor).
+        A keyframe of one sensor is compared by the words, too (*measured*: of keyframes with image and scan, they add
+        nothing to the descriptor).
 
         Args:
             keyframe: the query.
@@ -201,26 +201,24 @@ class PlaceDatabase:
         self.store.close()
 
     def _learn_words(self) -> None:
-        """Fit words, once there are enough images, and describe all places with them."""
+        """Fit words, once there are enough local vectors, and describe all places with them."""
         if self.words is not None or self.store.read_only or self.store.with_scene < FITTED_ON:
             return
-        scenes = (self[row].embedding.scene for row in self.store.rows_with_scene(FITTED_ON))
-        words = fit_words([scene for scene in scenes if scene is not None])
+        words = fit_words([self[row].embedding.scene for row in self.store.rows_with_scene(FITTED_ON)])
         self.store.freeze_words(words)
         self.words = words
 
     def _describe(self, keyframe: Keyframe) -> Code | None:
-        scene = keyframe.embedding.scene
-        return None if self.words is None or scene is None else self.words.describe(scene)
+        return None if self.words is None else self.words.describe(keyframe.embedding.scene)
 
     def _compare_words(self, keyframe: Keyframe, rows: Rows) -> Points:
-        """Return similarities (R,) of places by the words; 0 without words or images, or where scans are compared."""
+        """Return similarities (R,) of places by the words; 0 without words, or for keyframes of both sensors."""
         similarity = np.zeros(len(rows), np.float32)
-        if self.words is None or keyframe.embedding.cloud is not None or not len(rows):
+        if self.words is None or not len(rows) or not (share := worth(keyframe.embedding)):
             return similarity
         if (code := self._describe(keyframe)) is not None:
-            known, codes = self.store.codes(rows, self.words.code_bytes)
-            similarity[known] = self.words.compare(code, codes)
+            known, codes = self.store.codes(rows, len(code))
+            similarity[known] = share * self.words.compare(code, codes)
         return similarity
 
     def _open_index(self, dimension: int) -> PlaceIndex:

@@ -195,11 +195,9 @@ class KeyframeStore:
 
     def freeze_words(self, words: Words) -> None:
         """Store words, and the codes of all keyframes so far, in one transaction."""
-        rows = self.rows_with_scene(len(self))
         codes = []
-        for index in rows:
-            scene = self[index].embedding.scene
-            code = None if scene is None else words.describe(scene)
+        for index in self.rows_with_scene(len(self)):
+            code = words.describe(self[index].embedding.scene)
             codes.append((b"" if code is None else code.tobytes(), int(self.keys["id"][index])))
         with self._lock, self._file.writing() as connection:
             connection.execute("INSERT INTO words VALUES (?, ?)", (words.name, words.centres.tobytes()))

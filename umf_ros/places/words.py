@@ -1,4 +1,4 @@
-"""Words of a place database: hard-assigned VLAD [Jégou 2010] on the image trunk's map, with one bit per component."""
+"""Words of a place database: hard-assigned VLAD [Jégou 2010] on the network's local vectors, one bit per component."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.frames import Points
+from umf_ros.core.frames import Embedding, Points
 
 WORDS = 64
 """Words of a vocabulary (*measured*: 32 give the same recall within one query, 128 less)."""
 FITTED_ON = 40
-"""Keyframes with images that the words are fitted to (*measured*: 80, or all, move recall by less than a point)."""
+"""Keyframes that the words are fitted to (*measured*: 80, or all, move recall by less than a point)."""
 ROUNDS = 15
 """Rounds of k-means (*by hand*: the assignments no longer change recall after ten)."""
+SCAN_SHARE = 0.46
+"""Worth of the words of scans, as a share of that of images (*fitted*: weights 0.25 and 0.54; training.md)."""
 SERIAL_ROWS = 32
 """Local vectors per product: OpenBLAS computes such a product on one thread, always in the same order."""
 SEED = 0
 
 Scene = NDArray[np.int8]
-"""Local vectors (N, C) of an image, as in `Embedding.scene`."""
+"""Local vectors (N, C) of an image or a scan, as in `Embedding.scene`."""
 Code = NDArray[np.uint8]
 """Code (B,) of an image: a byte per eight words, whether they occur, then their signs (WORDS, C / 8)."""
 
@@ -46,14 +48,9 @@ class Words:
         """Hash of the words: codes of other words cannot be compared."""
         return hashlib.sha256(np.ascontiguousarray(self.centres, "<f4").tobytes()).hexdigest()[:8]
 
-    @property
-    def code_bytes(self) -> int:
-        """Bytes of a code."""
-        return WORDS // 8 + WORDS * -(-self.centres.shape[1] // 8)
-
-    def describe(self, scene: Scene) -> Code | None:
-        """Return the code of an image; None if its vectors are of another trunk."""
-        if scene.ndim != 2 or scene.shape[1] != self.centres.shape[1]:
+    def describe(self, scene: Scene | None) -> Code | None:
+        """Return the code of local vectors; None if there are none, or they are of another trunk or sensor."""
+        if scene is None or scene.ndim != 2 or scene.shape[1] != self.centres.shape[1]:
             return None
         vectors = _unit(scene)
         sums, count = _sums(vectors, _nearest(vectors, self.centres))
@@ -71,19 +68,25 @@ class Words:
         bits = _BITS[codes[:, head:] ^ query[head:]]
         different = bits.reshape(len(codes), WORDS, bits.shape[1] // WORDS).sum(axis=2)
         products = ((dimension - 2 * different) * (occurs & other)).sum(axis=1)
-        norm = np.sqrt(np.maximum(occurs.sum() * other.sum(axis=1), 1)) * dimension
-        return (products / norm).astype(np.float32)
+        return (products / (np.sqrt(np.maximum(occurs.sum() * other.sum(axis=1), 1)) * dimension)).astype(np.float32)
 
 
-def fit_words(scenes: Sequence[Scene]) -> Words:
-    """Fit words to images by k-means, started from spread vectors [Arthur 2007]; the same ones every time."""
-    vectors, rng = _unit(np.concatenate(scenes)), np.random.default_rng(SEED)
+def worth(embedding: Embedding) -> float:
+    """Return the share of the similarity by words that counts: all for an image alone, nothing for both sensors."""
+    return 1.0 if embedding.cloud is None else SCAN_SHARE * (embedding.image is None)
+
+
+def fit_words(scenes: Sequence[Scene | None]) -> Words:
+    """Fit words by k-means, started from spread vectors [Arthur 2007]: to images, or to scans if these are more."""
+    sizes = [one.shape[1] for one in scenes if one is not None]
+    chosen = [one for one in scenes if one is not None and one.shape[1] == max(sizes, key=sizes.count)]
+    vectors, rng = _unit(np.concatenate(chosen)), np.random.default_rng(SEED)
     centres = np.empty((WORDS, vectors.shape[1]), np.float32)
     squared = np.ones(len(vectors))
     for number in range(WORDS):
         total = np.cumsum(squared)
-        chosen = int(np.searchsorted(total, rng.random() * total[-1], side="right"))
-        centres[number] = vectors[min(chosen, len(vectors) - 1)]
+        drawn = int(np.searchsorted(total, rng.random() * total[-1], side="right"))
+        centres[number] = vectors[min(drawn, len(vectors) - 1)]
         squared = np.minimum(squared, ((vectors - centres[number]) ** 2).sum(axis=1, dtype=float))
     for _ in range(ROUNDS):
         sums, count = _sums(vectors, _nearest(vectors, centres))
@@ -93,8 +96,7 @@ def fit_words(scenes: Sequence[Scene]) -> Words:
 
 def _unit(scene: Scene) -> Points:
     vectors = scene.astype(np.float32)
-    unit: Points = vectors / np.maximum(np.sqrt((vectors**2).sum(axis=1, keepdims=True)), np.float32(1e-9))
-    return unit
+    return np.asarray(vectors / np.maximum(np.sqrt((vectors**2).sum(axis=1, keepdims=True)), np.float32(1e-9)))
 
 
 def _nearest(vectors: Points, centres: Points) -> NDArray[np.intp]:

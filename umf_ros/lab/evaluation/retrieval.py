@@ -15,7 +15,7 @@ from umf_ros.core.geometry import Array
 from umf_ros.embedding import Embedder
 from umf_ros.lab.datasets.sample import Rule, distances, label, places_of
 from umf_ros.places.database import is_past
-from umf_ros.places.words import FITTED_ON, fit_words
+from umf_ros.places.words import FITTED_ON, fit_words, worth
 from umf_ros.verification.rerank import Counter, Counts, count_inliers, mutual_neighbours, rerank, similarities
 
 THESIS_RULE = Rule(positive_m=12.0, positive_deg=30.0, negative_m=60.0, negative_deg=30.0)
@@ -302,18 +302,14 @@ class Reranking:
 
 
 def word_similarity(queries: Sequence[Keyframe], references: Sequence[Keyframe]) -> Array:
-    """(Q, R) similarity by words of the first references, as in a place database; 0 without an image or too few."""
+    """(Q, R) similarity by words of the first references, as in a place database; 0 where there are none or too few."""
     found = np.zeros((len(queries), len(references)))
     scenes = [one.embedding.scene for one in references]
     if len(known := [scene for scene in scenes if scene is not None]) < FITTED_ON:
         return found
     words = fit_words(known[:FITTED_ON])
     ours, theirs = (
-        {
-            row: code
-            for row, scene in enumerate(each)
-            if scene is not None and (code := words.describe(scene)) is not None
-        }
+        {row: code for row, scene in enumerate(each) if (code := words.describe(scene)) is not None}
         for each in ([one.embedding.scene for one in queries], scenes)
     )
     codes = np.stack(list(theirs.values()))
@@ -323,9 +319,8 @@ def word_similarity(queries: Sequence[Keyframe], references: Sequence[Keyframe])
 
 
 def with_words(similarity: Array, words: Array, queries: Sequence[Keyframe]) -> Array:
-    """(Q, R) both similarities for queries without a scan, the network's for the others: those of a place database."""
-    without_scan = np.array([one.embedding.cloud is None for one in queries])
-    combined: Array = combine(similarity, words * without_scan[:, None])
+    """(Q, R) both similarities for queries of one sensor, the network's for the others: those of a place database."""
+    combined: Array = combine(similarity, words * np.array([[worth(one.embedding)] for one in queries]))
     return combined
 
 
