@@ -33,7 +33,7 @@ from umf_ros.core.errors import ConfigError, MessageError, OutputError, UmfError
 from umf_ros.core.io import check_writable
 from umf_ros.map_poses import InitialPose, MapPoses
 from umf_ros.nodes.conversions import from_time, latched, sensor_qos
-from umf_ros.nodes.diagnostics import WARN, InputWatch
+from umf_ros.nodes.diagnostics import WARN, InputWatch, published_types
 from umf_ros.nodes.parameters import changed_settings, declare, with_own_odometry
 from umf_ros.nodes.process import Worker, interruptible, log_to
 from umf_ros.sensors.calibration import Calibration
@@ -119,8 +119,7 @@ class BaseNode(LifecycleNode, ABC):
         """Name the topics that no parameter names; False while they are not there."""
         if self._finder is None:
             return True
-        types = {topic: kinds[0] for topic, kinds in self.get_topic_names_and_types() if self.count_publishers(topic)}
-        found = self._finder.look(types, time.monotonic(), settling_s)
+        found = self._finder.look(published_types(self), time.monotonic(), settling_s)
         if found is not None:
             self._settings, self._finder = found, None
             self.get_logger().info(describe_inputs(found, self._input_names))

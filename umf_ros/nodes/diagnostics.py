@@ -30,6 +30,11 @@ def status(level: bytes, name: str, message: str, values: Mapping[str, object]) 
     return DiagnosticStatus(level=level, name=name, message=message, values=pairs)
 
 
+def published_types(node: Node) -> dict[str, str]:
+    """Return message type by topic that has a publisher."""
+    return {topic: kinds[0] for topic, kinds in node.get_topic_names_and_types() if node.count_publishers(topic)}
+
+
 class InputWatch:
     """Watch of one input topic: counts its messages and explains their absence.
 
