@@ -100,7 +100,7 @@ def test_the_runtime_imports_without_the_lab() -> None:
 
 def test_recordings_are_played_and_graph_files_read_without_the_packages_of_the_lab() -> None:
     names = modules(light())
-    assert len(names) == 19
+    assert len(names) == 20
     used = {name for path in light() for name in imports(path) if name.startswith("umf_ros.lab.")}
     assert used - {"umf_ros.lab.commands"} <= set(names)  # the demo, beside play, simulates first
     statements = [without(lab_packages()), *(f"import {name}" for name in names)]

@@ -17,7 +17,7 @@ from umf_ros.core.config import Qos, Topics
 from umf_ros.core.errors import UmfError
 from umf_ros.lab.live.bag_player_node import message_type
 from umf_ros.nodes.conversions import latched, sensor_qos
-from umf_ros.nodes.diagnostics import InputWatch, published_types
+from umf_ros.nodes.diagnostics import InputWatch
 from umf_ros.nodes.process import init
 from umf_ros.sensors.decode import TYPES
 from umf_ros.sensors.tf import TOPIC as TRANSFORMS
@@ -62,8 +62,9 @@ def _find_sensors(node: Node) -> dict[str, str]:
     types, since_s = dict[str, str](), time.monotonic()
     end_s = since_s + SEARCH_S
     while LARGE_TYPES.isdisjoint(types.values()) or time.monotonic() < since_s + SETTLING_S:
-        if types != (types := {topic: kind for topic, kind in published_types(node).items() if not is_own(topic)}):
-            since_s = time.monotonic()
+        before, names = types, node.get_topic_names_and_types()
+        types = {topic: kinds[0] for topic, kinds in names if node.count_publishers(topic) and not is_own(topic)}
+        since_s = since_s if types == before else time.monotonic()
         if time.monotonic() > end_s and LARGE_TYPES.isdisjoint(types.values()):
             others = [f"{topic} ({kind})" for topic, kind in types.items() if not kind.startswith("rcl_interfaces/")]
             raise UmfError(
