@@ -275,7 +275,7 @@ def _about_gaps(bag: Bag, found: Inspected) -> Iterator[Advice]:
 
 def write_settings(found: Inspected, calibration: str) -> str:
     """A first parameter file: the topics, and the calibration beside it; an input without a topic is left out by ""."""
-    notes = ["What umf inspect found; docs/parameters.md lists everything that may stand here."]
+    notes = ["Found by umf inspect; docs/parameters.md lists everything that may stand here."]
     notes += [f"topics.{name}: one of {', '.join(fits)}" for name, fits in found.ambiguous.items()]
     topics = {name: topic for name, topic in found.topics.model_dump().items() if name not in found.ambiguous}
     parameters: dict[str, Any] = {"calibration": calibration, "topics": topics}
