@@ -30,14 +30,7 @@ from umf_ros.lab.fit.acceptance import (
     save_examples,
 )
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
-from umf_ros.lab.simulation.domains.pairs import (
-    ELSEWHERE,
-    QUICK,
-    ScannedPlace,
-    ScanPair,
-    pairs_of,
-    places_of,
-)
+from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, QUICK, ScannedPlace, ScanPair, pairs_of, places_of
 from umf_ros.lab.simulation.drives import SurveyedDrive, embedded, kept, kept_in, worlds
 from umf_ros.lab.simulation.scenes import TRAPS
 from umf_ros.lab.simulation.world import VALIDATION
