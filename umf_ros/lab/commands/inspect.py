@@ -69,16 +69,15 @@ def doctor(
     write: Annotated[
         Path, typer.Option("--write", help="With --live: folder for my_rover.yaml and my_calibration.yaml.")
     ] = Path("config"),
-    config: Annotated[
-        Path | None, typer.Option("--config", help="With --live: check this parameter file and write none.")
-    ] = None,
+    config: ConfigPath = None,
     changes: Changes = None,
 ) -> None:
     """Check this machine: packages, ROS 2, DDS, weights; name a remedy for every fault.
 
     With --live, check the sensors of the robot that runs now: it finds their topics by type, records them for 5 s, and
     says what arrives at which rate, what lacks a calibration, and what is not synchronised. It writes the parameter
-    file with which the nodes start. Exit status 3: no closure could be found with these inputs.
+    file with which the nodes start; with --config, it checks that one instead. Exit status 3: the inputs cannot give a
+    closure.
     """
     if not live:
         options = {"--dry-run": dry_run, "--write": write != Path("config"), "--config": config, "--set": changes}

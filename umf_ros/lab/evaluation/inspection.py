@@ -86,10 +86,7 @@ def inspect(bag: Bag, source: ParameterSource = None, for_file: bool = False, is
     if for_file:
         by_type = find_topics(bag.types)[0].model_dump().items()
         named = load_settings(source).topics.model_fields_set
-        heard = {name: topic for name, topic in by_type if topic and bag.topics[topic].count}
-        lacking = {
-            name: topic for name, topic in heard.items() if not getattr(found.topics, name) and name not in named
-        }
+        lacking = {name: topic for name, topic in by_type if name not in named and not getattr(found.topics, name)}
         found.topics = found.topics.model_copy(update=lacking)
     for name, fits in found.ambiguous.items():
         again = ("doctor", "--live") if is_live else ("inspect", bag.path)
