@@ -93,7 +93,7 @@ def doctor(
     from rich.console import Console
 
     from umf_ros.bags.reader import open_bag
-    from umf_ros.commands.console import waiting
+    from umf_ros.commands.console import PLAIN, waiting
     from umf_ros.core.config import load_settings
     from umf_ros.core.errors import UmfError
     from umf_ros.lab.evaluation.inspection import Advice, inspect
@@ -107,22 +107,21 @@ def doctor(
             silent = record_robot(recorded, load_settings(source).topics)
         robot = open_bag(recorded)
         found = inspect(robot, source, for_file=config is None, is_live=True)
-        unplaced = (
-            [Advice("warning", silent.pop(TOPIC), "the calibration has to hold the mountings")]
-            if TOPIC in silent
-            else []
-        )
+        unplaced = silent.pop(TOPIC, "")
         if config is None and not silent and not found.fault:
             file, told = _write(found, robot, Path(folder) if dry_run else write)
             found = inspect(robot, file, is_live=True)
             told = f"{write / file.name} is not written, as --dry-run says" if dry_run else told
-    found.advice += unplaced
+    if unplaced and config is None:
+        found.advice.append(Advice("warning", unplaced, "the calibration has to hold the mountings"))
     _tell(console, recorded.name, robot, found)
     if silent:
         causes = "; ".join(f"{name}: {cause}" for name, cause in silent.items())
         raise UmfError(f"{causes}; start what publishes them, or leave one out with --set topics.NAME=")
+    if told:
+        console.print(told, **PLAIN)
     launch = "" if dry_run else f": ros2 launch umf_ros loop_closure.launch.py params_file:={file}"
-    _conclude(console, found, "\n".join([*filter(None, [told]), f"Ready for loop closure{launch}"]))
+    _conclude(console, found, f"Ready for loop closure{launch}")
 
 
 def _conclude(console: Console, found: Inspected, ready: str) -> None:
@@ -161,6 +160,7 @@ def _tell(console: Console, title: object, recording: Bag, found: Inspected) -> 
     from umf_ros.core.config import topics_of
     from umf_ros.core.errors import printable
     from umf_ros.runs.report import COLOURS
+    from umf_ros.sensors.tf import transform_topics
     from umf_ros.sensors.topic_finder import describe_inputs
 
     console.print(f"{printable(title)}: {recording.duration_s:.1f} s", **PLAIN)
@@ -173,7 +173,8 @@ def _tell(console: Console, title: object, recording: Bag, found: Inspected) -> 
         if topic in rates:
             table.add_row(name, escape(topic), rates[topic], escape(found.found.get(name, "no message")))
     print_table(console, table)
-    others = [f"{topic} ({rates[topic]})" for topic in sorted(recording.types.keys() - set(known.values()))]
+    used = {*known.values(), *transform_topics(recording.types)}
+    others = [f"{topic} ({rates[topic]})" for topic in sorted(recording.types.keys() - used)]
     if others:
         console.print(f"not used: {', '.join(others)}", style="dim", **PLAIN)
     if "pairs" in found.found:
