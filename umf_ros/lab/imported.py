@@ -86,9 +86,9 @@ def pose_entry(pose: Array) -> dict[str, list[float]]:
     return dict(zip(("translation", "quaternion"), ([float(v) for v in values] for values in numbers), strict=True))
 
 
-def with_notes(notes: Iterable[str], content: dict[str, Any]) -> str:
-    """YAML under comments."""
-    return "".join(f"# {note}\n" for note in notes) + yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+def with_notes(notes: Iterable[str], content: dict[str, Any], flow: bool | None = None) -> str:
+    """YAML under comments; with `flow` false each value has a line of its own."""
+    return "".join(f"# {note}\n" for note in notes) + yaml.safe_dump(content, sort_keys=False, default_flow_style=flow)
 
 
 _LAYOUT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
@@ -156,7 +156,7 @@ def write_recording(found: Imported, out: Path, progress: Callable[[float], None
     notes = [f"{TO_BE_MEASURED}: {what}" for what in found.guessed]
     write_atomically(calibration, with_notes(notes, found.calibration()))
     parameters = {"calibration": str(calibration.resolve()), "topics": TOPICS.model_dump()}
-    write_atomically(config, with_notes((), {"/**": {"ros__parameters": parameters}}))
+    write_atomically(config, with_notes((), {"/**": {"ros__parameters": parameters}}, flow=False))
     return config
 
 

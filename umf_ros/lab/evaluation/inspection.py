@@ -278,7 +278,7 @@ def write_settings(found: Inspected, calibration: str) -> str:
     parameters: dict[str, Any] = {"calibration": calibration, "topics": topics}
     if found.topics.cloud and not found.topics.odometry:
         parameters["odometry"] = {"engine": ENGINE}
-    return with_notes(notes, {"/**": {"ros__parameters": parameters}})
+    return with_notes(notes, {"/**": {"ros__parameters": parameters}}, flow=False)
 
 
 def calibration_of_dataset(found: Inspected, bag: Bag) -> Path | None:
