@@ -181,12 +181,8 @@ def _entries(found: Imported) -> Iterator[Entry]:
     for topic, files, right in zip(infos, cameras.values(), (False, True), strict=True):
         if files:
             camera = StereoCamera(**found.camera["camera"])
-            yield (
-                first_ns,
-                topic,
-                TYPES["left_info"][0],
-                partial(camera_info_message, camera, first_ns, "camera", right),
-            )
+            make = partial(camera_info_message, camera, first_ns, "camera", right)
+            yield first_ns, topic, TYPES["left_info"][0], make
 
 
 def _image(path: Path, stamp_ns: int) -> Any:

@@ -210,10 +210,8 @@ def _about_odometry(bag: Bag, found: Inspected) -> Iterator[Advice]:
         imu = [topic for topic, info in bag.topics.items() if info.type == "sensor_msgs/msg/Imu"]
         also = f"; {imu[0]} is an IMU, which is no odometry" if imu else ""
         if found.topics.cloud and found.is_live:
-            yield Advice(
-                "note",
-                f"no odometry{also}: loop_closure_node makes it from {found.topics.cloud} (odometry.engine: {ENGINE})",
-            )
+            made = f"loop_closure_node makes it from {found.topics.cloud} (odometry.engine: {ENGINE})"
+            yield Advice("note", f"no odometry{also}: {made}")
         elif found.topics.cloud:
             what = f"no odometry{also}: umf replay, umf slam and umf map make it from {found.topics.cloud} (vgicp)"
             yield Advice("note", what, "--odometry FILE.tum takes that of another system")

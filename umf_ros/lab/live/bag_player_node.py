@@ -16,7 +16,6 @@ import rclpy
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 from rich.console import Console
 from rosgraph_msgs.msg import Clock
@@ -25,6 +24,7 @@ from umf_ros.bags.reader import Bag, open_bag
 from umf_ros.commands.console import LineProgress, waiting
 from umf_ros.core.errors import BagError, UmfError
 from umf_ros.core.resources import find
+from umf_ros.nodes.conversions import latched
 from umf_ros.nodes.process import complain, init
 
 CLOCK_PERIOD_NS = 10_000_000
@@ -97,7 +97,7 @@ class BagPlayer(Node):
             elif topic != "/clock" and info.count:
                 # in a namespace its topics move along; the trees of transforms are one for all
                 name = topic if topic in ("/tf", "/tf_static") else topic.removeprefix("/")
-                publishers[topic] = self.create_publisher(kind, name, _qos(topic))
+                publishers[topic] = self.create_publisher(kind, name, latched(20) if topic == "/tf_static" else 20)
         if not publishers:
             raise BagError(f"{self._bag.path} holds no topic whose message type is installed")
         return publishers
@@ -137,12 +137,6 @@ def message_type(name: str) -> Any | None:
         return getattr(importlib.import_module(f"{package}.msg"), kind, None)
     except ImportError:
         return None
-
-
-def _qos(topic: str) -> QoSProfile:
-    latched = topic == "/tf_static"
-    durability = QoSDurabilityPolicy.TRANSIENT_LOCAL if latched else QoSDurabilityPolicy.VOLATILE
-    return QoSProfile(depth=20, reliability=QoSReliabilityPolicy.RELIABLE, durability=durability)
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:

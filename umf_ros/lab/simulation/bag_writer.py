@@ -21,21 +21,13 @@ from umf_ros.core.frames import StereoCamera
 from umf_ros.core.geometry import Array, to_quaternion
 from umf_ros.core.io import atomic_write
 
-CLOUD_TYPE = np.dtype(
-    [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("intensity", "<u4"),
-        ("ambient_light", "<u4"),
-        ("point_id", "<u4"),
-        ("point_time_offset", "<u4"),
-    ]
-)
+_COUNTS = ("intensity", "ambient_light", "point_id", "point_time_offset")
+CLOUD_TYPE = np.dtype([*((axis, "<f4") for axis in "xyz"), *((name, "<u4") for name in _COUNTS)])
 """The 28 bytes of a Blickfeld point; the time is in ns after the stamp of the message."""
 
 _TYPES = message_types().types
-_FLOAT32, _UINT32 = 7, 6
+_DATATYPES = {"f": 7, "u": 6}
+"""Of float32 and uint32 in a PointField."""
 
 
 def _new(kind: str, **values: Any) -> Any:
@@ -98,13 +90,7 @@ def camera_info_message(camera: StereoCamera, stamp_ns: int, frame: str, right: 
 def packed_cloud(records: NDArray[Any], stamp_ns: int, is_dense: bool) -> Any:
     """sensor_msgs/PointCloud2 in the frame `lidar` of records, whose fields are of four bytes."""
     fields = [
-        _new(
-            "sensor_msgs/msg/PointField",
-            name=name,
-            offset=offset,
-            datatype=_FLOAT32 if kind.kind == "f" else _UINT32,
-            count=1,
-        )
+        _new("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=_DATATYPES[kind.kind], count=1)
         for name, (kind, offset, *_) in (records.dtype.fields or {}).items()
     ]
     return _new(
