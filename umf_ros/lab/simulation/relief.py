@@ -22,7 +22,7 @@ CELLS = round(SIZE_M / CELL_M)
 _SHORE_M = 10.0
 
 
-class Level:
+class LevelGround:
     """A place whose floor or road is level."""
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:

@@ -10,13 +10,13 @@ from scipy.ndimage import uniform_filter
 
 from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.domains.solids import Scene, Solids, closed, distance_to, rounded_rectangle, wobbly_ring
-from umf_ros.lab.simulation.relief import Level
+from umf_ros.lab.simulation.relief import LevelGround
 
 MODULE_M = 3.2
 DOOR_M = 1.3
 
 
-class Corridor(Level):
+class Corridor(LevelGround):
     """Four corridors around a core: doors at equal distances, here and there a niche, a pillar, a cupboard."""
 
     lateral_m = 0.35
@@ -72,7 +72,7 @@ class Corridor(Level):
                 solids.box([*place, 0.0], size, float(np.arctan2(along[1], along[0])), rng.uniform(0.2, 0.6))
 
 
-class Rooms(Level):
+class Rooms(LevelGround):
     """Two rows of furnished rooms with doors between them; chairs move."""
 
     lateral_m = 0.2
@@ -212,7 +212,7 @@ def _smooth(values: Array, times: int) -> Array:
     return smoothed
 
 
-class Tunnel(Level):
+class Tunnel(LevelGround):
     """A vaulted tunnel that closes to a ring; without features nothing varies along it."""
 
     lateral_m = 0.35
@@ -239,7 +239,7 @@ class Tunnel(Level):
 SWAPPED = 0.1  # of the goods and pots, between visits
 
 
-class Rows(Level):
+class Rows(LevelGround):
     """A hall of parallel rows: racks of goods in a warehouse, benches of plants in a greenhouse.
 
     Rows resemble each other: their goods differ a little in size, and a few slots are full in one row and empty in

@@ -8,14 +8,14 @@ import numpy as np
 
 from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.domains.solids import Scene, Solids, rounded_rectangle
-from umf_ros.lab.simulation.relief import Level
+from umf_ros.lab.simulation.relief import LevelGround
 
 HALF_ROAD_M, PAVEMENT_M = 4.0, 2.2
 OCCUPIED = 0.55
 """Share of the parking lots with a car."""
 
 
-class Street(Level):
+class Street(LevelGround):
     """A rectangular circuit of roads between two rows of buildings; cars come and go."""
 
     lateral_m = 1.2
