@@ -1,4 +1,4 @@
-"""Flat ground with upright cylinders on it, and the scans of a spinning LiDAR there."""
+"""Flat ground with upright cylinders or boxes on it, and the scans of a spinning LiDAR there."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from umf_ros.core.geometry import Array, make_pose, transform
+from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.verification import thin_scan
 
 BODY_T_LIDAR = make_pose(np.eye(3), [0.0, 0.0, 1.2])
@@ -43,3 +43,16 @@ def scan(map_T_body: Array, things: Sequence[Cylinder], reach_m: float = 30.0) -
 def placed(x: float, things: Sequence[Cylinder]) -> tuple[Array, Array, Array]:
     """A scan at x with its mounting and pose."""
     return scan(pose_at(x), things), BODY_T_LIDAR, pose_at(x)
+
+
+def yard_scan(seed: int, world_T_body: Array, boxes: int = 25) -> Array:
+    """A thinned scan, all around, of boxes and trunks on flat ground, each yard with its own."""
+    rng = np.random.default_rng(seed)
+    places, heights, sides = rng.uniform(-14, 14, (boxes, 2)), rng.uniform(0.6, 3, boxes), rng.uniform(0.2, 1.2, boxes)
+    noise = np.random.default_rng([seed, round(abs(world_T_body[0, 3]) * 100)])
+    parts = [np.column_stack([noise.uniform(-16, 16, (9000, 2)), np.zeros(9000)])]
+    for place, height, side in zip(places, heights, sides, strict=True):
+        angle, level = noise.uniform(0, 2 * np.pi, 300), noise.uniform(0, height, 300)
+        parts.append(np.column_stack([place + side * np.column_stack([np.cos(angle), np.sin(angle)]), level]))
+    points = np.vstack(parts) + noise.normal(0, 0.01, (9000 + 300 * boxes, 3))
+    return thin_scan(transform(invert(world_T_body), points).astype(np.float32))

@@ -139,10 +139,7 @@ def test_what_is_not_python_is_installed_with_the_package(install: Path) -> None
 
 @pytest.mark.parametrize(
     ("wing", "lists"),
-    [
-        ("runtime", ["dependencies", "elevation", "fleet", "rerun", "torch"]),
-        ("lab", ["dependencies", "lab", "las"]),
-    ],
+    [("runtime", ["dependencies", "elevation", "fleet", "rerun", "torch"]), ("lab", ["dependencies", "lab", "las"])],
 )
 def test_what_is_imported_is_required(wing: str, lists: list[str]) -> None:
     """Every distribution by its own name: what another one happens to bring along may be gone tomorrow."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import takewhile
+
 import numpy as np
 import rclpy
 from foreign_messages import VELODYNE
@@ -46,9 +49,15 @@ class Vlp16Rover(Node):
 
         assert wait_until(is_heard, 60.0, self.spin), [process.output for process in processes]
 
-    def drive(self, seconds: float, start_s: int = 1_700_000_000, pause_s: float = 0.05) -> None:
+    def drive(
+        self,
+        seconds: float,
+        start_s: int = 1_700_000_000,
+        pause_s: float = 0.05,
+        is_over: Callable[[], bool] = lambda: False,
+    ) -> None:
         """Scans of sixteen rings, images and odometry at 5 Hz, driving ahead at 1 m/s; in real time with .2 s."""
-        for step in range(int(5 * seconds)):
+        for step in takewhile(lambda _: not is_over(), range(int(5 * seconds))):
             stamp = to_time(start_s * 10**9 + step * 200_000_000)
             odometry = Odometry(child_frame_id="base_link")
             odometry.header.frame_id, odometry.header.stamp = "odom", stamp

@@ -43,7 +43,7 @@ COMMANDS = {
     "train": "umf_ros.lab.commands.train",
     "export": "umf_ros.lab.commands.train:export",
     "bench": "umf_ros.lab.commands.bench:app",
-    "doctor": "umf_ros.commands.doctor",
+    "doctor": "umf_ros.lab.commands.inspect:doctor",
     "graph": "umf_ros.lab.commands.graph:app",
     "places": "umf_ros.commands.stores:places",
     "fleet": "umf_ros.commands.stores:fleet",

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu, NavSatFix
 
-from umf_ros.absolute.measurement import (
-    AbsoluteDecoder,
-    AbsoluteMeasurement,
-    Aid,
-    parse_numbers,
-)
+from umf_ros.absolute.measurement import AbsoluteDecoder, AbsoluteMeasurement, Aid, parse_numbers
 from umf_ros.core.errors import ConfigError, MessageError
 from umf_ros.core.geometry import from_enu, from_quaternion, make_pose, to_enu
 

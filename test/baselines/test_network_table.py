@@ -19,12 +19,7 @@ from umf_ros.baselines.place_network import (
     some_points,
     stack,
 )
-from umf_ros.baselines.place_networks import (
-    NETWORKS,
-    load_place_network,
-    locate_place_weights,
-    make_place_network,
-)
+from umf_ros.baselines.place_networks import NETWORKS, load_place_network, locate_place_weights, make_place_network
 from umf_ros.baselines.pointnet2 import ball_query, farthest_points
 from umf_ros.core.errors import ConfigError, WeightsError
 from umf_ros.embedding.inputs import voxelise

@@ -69,13 +69,7 @@ def test_true_false_and_misplaced_closures_are_told_apart():
         ]
     )
     counted = {key: figures[key] for key in figures if key.startswith(("true", "false"))}
-    assert counted == {
-        "true_pairs": 4,
-        "true_accepted": 2,
-        "true_misplaced": 1,
-        "false_pairs": 2,
-        "false_accepted": 1,
-    }
+    assert counted == {"true_pairs": 4, "true_accepted": 2, "true_misplaced": 1, "false_pairs": 2, "false_accepted": 1}
     assert figures["error_median_m"] == pytest.approx(0)
     assert figures["inside_95"] == 1
 

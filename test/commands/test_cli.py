@@ -128,6 +128,7 @@ NO_BAG = "there is no recording nowhere.mcap"
     ("arguments", "message"),
     [
         (["demo", "--bag", "nowhere.mcap"], NO_BAG),
+        (["doctor", "--dry-run"], "the checks of the machine have no use for --dry-run"),
         (["demo", "--out", "/proc/results"], "cannot write to /proc/results"),
         (["replay", "nowhere.mcap"], NO_BAG),
         (["play", "nowhere.mcap", "--rate", "2"], NO_BAG),

@@ -6,7 +6,6 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy
 import pytest
 
 from umf_ros import embedding
@@ -22,12 +21,6 @@ def broken_package(folder: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> 
     return "brokenpackage"
 
 
-def test_a_good_package_is_fine_and_shows_its_version() -> None:
-    finding = checks.check_package("numpy", "numpy", "1.26")
-    assert finding.fine
-    assert finding.found == numpy.__version__
-
-
 @pytest.mark.parametrize(
     ("code", "found", "advice"),
     [
@@ -40,7 +33,7 @@ def test_a_broken_package_is_a_problem_with_advice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, found: str, advice: str
 ) -> None:
     name = broken_package(tmp_path, monkeypatch, code)
-    finding = checks.check_package(name, name, "2")
+    finding = checks.check_package(name, name, "2", "a rover does without")
     assert not finding.fine
     assert found in finding.found
     assert advice in finding.advice
@@ -69,11 +62,6 @@ def test_the_network_needs_openvino_or_torch(monkeypatch: pytest.MonkeyPatch) ->
     assert {name: finding.fine for name, finding in found.items()} == {"openvino": False, "torch": False}
 
 
-def test_what_a_rover_may_do_without_has_to_work_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    name = broken_package(tmp_path, monkeypatch, "raise OSError('libusb-1.0.so.0: cannot open shared object file')")
-    assert not checks.check_package(name, name, "1", "a rover does without").fine
-
-
 def test_dds_really_exchanges_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "77")
     finding = checks.check_dds()
@@ -86,12 +74,6 @@ def test_dds_that_cannot_work_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> N
     finding = checks.check_dds()
     assert not finding.fine
     assert "RMW_IMPLEMENTATION" in finding.advice
-
-
-def test_every_check_has_its_own_name() -> None:
-    names = [name for name, _ in checks.checks()]
-    assert len(names) == len(set(names)) > 15
-    assert {"gtsam", "faiss-cpu", "small_gicp", "torch"} <= set(names)  # native libraries, each of which may be broken
 
 
 @pytest.mark.parametrize(("fine", "status"), [(True, 0), (False, 1)])

@@ -60,11 +60,7 @@ class Killer(threading.Thread):
 
 
 def test_ray_makes_the_same_map_though_a_worker_is_killed(
-    recordings: list[Path],
-    mini_config: Path,
-    alone: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    recordings: list[Path], mini_config: Path, alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = str(Path(spread_module.__file__).parents[1])
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (here, os.environ.get("PYTHONPATH", "")))))

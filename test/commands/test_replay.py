@@ -237,9 +237,7 @@ def test_results_that_have_no_place_are_one_clear_line(small: Path, tmp_path: Pa
     assert line.startswith(f"cannot write to {tmp_path}/file/results")
 
 
-def test_a_truncated_recording_is_used_without_truth_not_judged_and_its_name_keeps_its_brackets(
-    tmp_path: Path,
-) -> None:
+def test_a_truncated_recording_is_used_without_truth_not_judged_and_its_name_keeps_its_brackets(tmp_path: Path) -> None:
     whole = write_mcap(tmp_path / "whole.mcap", [entry for entry in traverse(3.0) if entry[0] != TRUTH]).read_bytes()
     bag = tmp_path / "cut [copy].mcap"
     bag.write_bytes(whole[: len(whole) * 2 // 3])

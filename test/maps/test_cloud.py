@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from command_line import umf
 from conftest import make_frame
+from ground import yard_scan
 
 from umf_ros.core.config import Settings, load_settings
 from umf_ros.core.errors import UmfError
@@ -17,7 +18,6 @@ from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle, tr
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.scan_files import read_points
-from umf_ros.lab.simulation.scenes import yard_scan
 from umf_ros.map_poses import MapPoses, hint_of
 from umf_ros.maps.cloud import VirtualLidar, along, standing, thinned
 from umf_ros.maps.outputs import CLOUD, write_points

@@ -13,6 +13,7 @@ from processes import wait_until
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
+from sources import ROOT
 
 from umf_ros.core.config import Qos
 from umf_ros.core.io import memory_mb
@@ -114,7 +115,7 @@ def test_without_a_publisher_the_topic_is_named(node: Node, clock: Clock) -> Non
 
 @pytest.mark.parametrize(
     ("reliability", "shown"),
-    [(QoSReliabilityPolicy.BEST_EFFORT, "best effort"), (QoSReliabilityPolicy.RELIABLE, "reliable")],
+    [(QoSReliabilityPolicy.BEST_EFFORT, "best_effort"), (QoSReliabilityPolicy.RELIABLE, "reliable")],
 )
 def test_publishers_that_are_not_heard_are_shown_with_their_qos(
     node: Node, clock: Clock, reliability: QoSReliabilityPolicy, shown: str
@@ -145,6 +146,13 @@ def test_a_line_of_diagnostics_is_text_for_any_value() -> None:
     line = status(diagnostics.ERROR, "name", "message", {"whole": 3, "real": 0.123456789, "text": "a b", "none": None})
     assert line.level == DiagnosticStatus.ERROR
     assert values_of(line) == {"whole": "3", "real": "0.123457", "text": "a b", "none": "None"}
+
+
+def test_every_category_of_failures_is_documented() -> None:
+    told = (ROOT / "docs" / "ros.md").read_text(encoding="utf-8")
+    assert [
+        name for name, remedy in diagnostics.FAILURES.items() if f"| `{name}` |" not in told or remedy not in told
+    ] == []
 
 
 def test_memory_is_what_is_resident_now() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import processes
 import pytest
 import tf2_messages
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from processes import Process, wait_until
 from rclpy.qos import QoSProfile
@@ -98,6 +99,12 @@ def test_transforms_decide_the_rig(tf2_msgs: None, rig: Vlp16Rover, tmp_path: Pa
     rig.create_publisher(TFMessage, "/tf_static", STATIC_QOS).publish(TFMessage(transforms=tree[:2]))
     scans: list[PointCloud2] = []
     rig.create_subscription(PointCloud2, "/loop_closure_node/keyframe_scans", scans.append, QoSProfile(depth=50))
+    categories: list[str] = []
+
+    def hear(message: DiagnosticArray) -> None:
+        categories.extend(one.value for one in message.status[0].values if one.key == "failure_category")
+
+    rig.create_subscription(DiagnosticArray, "/diagnostics", hear, 10)
     front = Process(
         FRONT_END, tmp_path / "front.log", "embedding.method:=thumbnail", f"results_dir:={tmp_path / 'run'}"
     )
@@ -105,6 +112,7 @@ def test_transforms_decide_the_rig(tf2_msgs: None, rig: Vlp16Rover, tmp_path: Pa
         rig.until_heard(front)
         rig.drive(1.0)
         front.wait_for("/tf_static does not say where camera_optical is on base_link")
+        assert wait_until(lambda: "no_calibration" in categories, 30.0, rig.spin), categories
         late = rig.create_publisher(TFMessage, "/tf_static", STATIC_QOS)
         late.publish(TFMessage(transforms=tree[2:]))
         assert wait_until(lambda: late.get_subscription_count() > 0, 30.0, rig.spin)

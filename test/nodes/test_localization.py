@@ -82,6 +82,7 @@ def test_pose_and_transform_come_once_the_rover_is_found(rover: Rover, map_folde
     process.wait_for("ready")
     assert rover.until(lambda: rover.odometry.get_subscription_count() and rover.closures.get_subscription_count())
     assert rover.until(lambda: rover.status.get("message", "").startswith("not localised"))
+    assert rover.until(lambda: rover.status["failure_category"] == "stale_odometry")
     first = on_circle(np.array([30.0]))[0]
     for step in range(30):
         stamp, here = LATER_NS + step * STEP_NS, on_circle(np.array([30 + step / 2]))[0]
@@ -89,6 +90,7 @@ def test_pose_and_transform_come_once_the_rover_is_found(rover: Rover, map_folde
         if step == 4:
             wait_until(lambda: False, 0.5, lambda: rclpy.spin_once(rover, timeout_sec=0.02))
             assert not rover.poses and not rover.transforms  # nothing is claimed before it is known
+            assert rover.until(lambda: rover.status["failure_category"] == "weak_overlap")
         if step % 2 == 0:
             row = 30 + step // 2
             match_T_query = relative(on_circle(np.array([row]))[0], here)

@@ -25,6 +25,7 @@ from umf_ros.core.config import Database, Settings
 from umf_ros.core.resources import find
 from umf_ros.detector import make_detector_embedder
 from umf_ros.nodes.conversions import SCAN_FIELDS, to_time
+from umf_ros.nodes.diagnostics import FAILURES
 from umf_ros.places.database import PlaceDatabase
 
 MODULE = "umf_ros.nodes.loop_closure_node"
@@ -206,7 +207,8 @@ def test_a_full_disk_shows_at_once_and_ends_nothing(rig: Rig, node: Process) -> 
             rig.publish_pair(START_NS + i * 213_000_000)
             rig.until(lambda i=i: rig.count("cloud_received") > i)
         assert rig.until(lambda: "cannot write" in rig.values.get("last_error", "")), node.output
-        assert rig.level == DiagnosticStatus.ERROR
+        assert rig.level == DiagnosticStatus.ERROR and rig.values["failure_category"] == "cannot_write"
+        assert rig.values["remedy"] == FAILURES["cannot_write"]
     stored = rig.count("places")
     for i in range(4, 9):
         rig.publish_pair(START_NS + i * 213_000_000)
@@ -294,6 +296,7 @@ def test_a_silent_topic_is_explained(rig: Rig, node: Process) -> None:
             or "nothing received from 1 publisher" in rig.messages.get("loop_closure_node: input left_image", "")
         )
     )
+    assert rig.until(lambda: rig.values["failure_category"] == "no_data")
     rig.destroy_publisher(rig.clouds)
     expected = "nothing received: no publisher on /bf_lidar/points_raw"
     assert rig.until(lambda: rig.messages.get("loop_closure_node: input cloud") == expected)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rclpy
+from ground import yard_scan
 from nav_msgs.msg import Odometry
 from processes import Process, wait_until
 from rclpy.node import Node
@@ -18,7 +19,6 @@ from umf_ros.core.config import load_settings
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.geometry import make_pose
 from umf_ros.core.resources import ODOMETRY_ENGINES
-from umf_ros.lab.simulation.scenes import yard_scan
 from umf_ros.nodes.conversions import to_cloud, to_header
 from umf_ros.nodes.parameters import OWN_ODOMETRY, with_own_odometry
 from umf_ros.sensors.decode import decode_pose

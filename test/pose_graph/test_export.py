@@ -7,17 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from graph_worlds import (
-    LAP,
-    SETTINGS,
-    closing,
-    content_of,
-    driven_file,
-    feed_odometry,
-    lap_pairs,
-    rms,
-    two_laps,
-)
+from graph_worlds import LAP, SETTINGS, closing, content_of, driven_file, feed_odometry, lap_pairs, rms, two_laps
 from sources import rows_of
 
 from umf_ros.bags.trajectories import read_tum

@@ -204,10 +204,7 @@ def laid_over(scale: float) -> Overlay:
         (SensorReport(intensity_max=0.0), "all intensities are 0"),
         (SensorReport(overlay=laid_over(1.5)), "stereo depth is 1.5 times that of the LiDAR"),
         (SensorReport(lidar=LIDAR, camera=FINE), "the LiDAR's mounting is off by 9 deg, mostly about y (+9 deg)"),
-        (
-            SensorReport(lidar=LIDAR, camera=LIDAR),
-            "the odometry is not that of the body: by the sensors",
-        ),
+        (SensorReport(lidar=LIDAR, camera=LIDAR), "the odometry is not that of the body: by the sensors"),
         (SensorReport(forward=np.array([0, 0, 0.9])), "the odometry is not that of the body: it moves along"),
         (SensorReport(lidar=Disagreement(-0.5, None), camera=FINE), "the LiDAR's clock is about +0.5 s off"),
         (

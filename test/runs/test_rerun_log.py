@@ -78,13 +78,7 @@ def test_the_map_and_verdicts_by_state_are_in_the_file(tmp_path: Path) -> None:
 def test_a_viewer_that_listens_shows_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "trajectory_optimized.tum").write_text("10.0 -15 0 0 0 0 0 1\n11.0 -14 0 0 0 0 0 1\n")
     monkeypatch.setattr(rerun_log, "PORT", free_port())
-    command = [
-        RERUN,
-        "--save",
-        str(tmp_path / "seen.rrd"),
-        "--port",
-        str(rerun_log.PORT),
-    ]
+    command = [RERUN, "--save", str(tmp_path / "seen.rrd"), "--port", str(rerun_log.PORT)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as receiver:
         assert receiver.stderr and any("Saving incoming" in line for line in iter(receiver.stderr.readline, ""))
         run(None, tmp_path)  # the receiver stands for a viewer, without a window

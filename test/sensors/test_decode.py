@@ -9,14 +9,7 @@ import pytest
 from recordings import POINT, START_NS, camera_info, cloud, drive, image, make, odometry, scan
 
 from umf_ros.core.errors import MessageError
-from umf_ros.sensors.decode import (
-    GreyRange,
-    decode_camera_info,
-    decode_cloud,
-    decode_image,
-    decode_pose,
-    stamp_ns,
-)
+from umf_ros.sensors.decode import GreyRange, decode_camera_info, decode_cloud, decode_image, decode_pose, stamp_ns
 
 POINTS = np.array([[1.0, 5.0, 0.5], [-2.0, 8.0, 1.0], [0.3, 12.0, -1.0]])
 
@@ -87,8 +80,7 @@ def test_black_images_of_16_bits_are_black() -> None:
 
 
 @pytest.mark.parametrize(
-    ("encoding", "channel"),
-    [("rgb16", 0), ("bgr16", 2), ("rgba16", 0), ("bgra16", 2), ("16UC3", 2), ("16UC4", 2)],
+    ("encoding", "channel"), [("rgb16", 0), ("bgr16", 2), ("rgba16", 0), ("bgra16", 2), ("16UC3", 2), ("16UC4", 2)]
 )
 def test_colours_of_16_bits(encoding: str, channel: int) -> None:
     pixels = np.zeros((4, 6, 4 if encoding in ("rgba16", "bgra16", "16UC4") else 3), "<u2")

@@ -6,19 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recordings import (
-    CALIBRATION,
-    CLOUD,
-    LEFT,
-    LEFT_INFO,
-    RIGHT,
-    START_NS,
-    camera_info,
-    cloud,
-    image,
-    odometry,
-    scan,
-)
+from recordings import CALIBRATION, CLOUD, LEFT, LEFT_INFO, RIGHT, START_NS, camera_info, cloud, image, odometry, scan
 
 from umf_ros.core.config import TRANSFORMS, Settings, Sync, Topics
 from umf_ros.sensors.calibration import calibration_of, load_calibration

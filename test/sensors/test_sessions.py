@@ -59,10 +59,7 @@ def test_what_comes_late_from_before_a_reset_is_stale() -> None:
 def test_what_is_still_held_at_the_end_was_wrong() -> None:
     clock = heard(("left", 5.0), ("odometry", 5.0), ("left", 1.0))
     clock.take(StampedInput("odometry", ns(5.1), make_pose(np.eye(3), [50, 0, 0])))
-    assert [(one.name, one.fault) for one in clock.finish()] == [
-        ("left", "clock jump"),
-        ("odometry", "position jump"),
-    ]
+    assert [(one.name, one.fault) for one in clock.finish()] == [("left", "clock jump"), ("odometry", "position jump")]
     assert clock.finish() == [] and clock.session == 0
 
 

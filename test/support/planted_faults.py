@@ -173,11 +173,7 @@ def axes_faults(settings: Settings) -> list[Planted]:
         Planted("odometry NED", ("odometry is not that of the body",), other_axes(down)),
         Planted("odometry optical", ("odometry is not that of the body",), other_axes(optical.T)),
         Planted("odometry left-handed", ("odometry's axes are left-handed",), other_axes(mirrored)),
-        Planted(
-            "odometry never turns",
-            ("orientation is constant",),
-            odometry(never),
-        ),
+        Planted("odometry never turns", ("orientation is constant",), odometry(never)),
         Planted(
             "camera off by 90 deg", ("camera's mounting is off",), calibration=camera(lambda it: it @ about("z", 90))
         ),

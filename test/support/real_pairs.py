@@ -12,15 +12,7 @@ import numpy as np
 from rich.progress import track
 
 from umf_ros.core.frames import Keyframe
-from umf_ros.core.geometry import (
-    Array,
-    adjoint,
-    from_quaternion,
-    invert,
-    logmap,
-    propagate,
-    ros_to_gtsam_covariance,
-)
+from umf_ros.core.geometry import Array, adjoint, from_quaternion, invert, logmap, propagate, ros_to_gtsam_covariance
 from umf_ros.lab.simulation.domains.pairs import is_wrong
 from umf_ros.runs.truth import normalised_errors, pose_error, share_inside
 from umf_ros.sensors.decode import Cloud

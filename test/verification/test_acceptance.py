@@ -26,11 +26,7 @@ from umf_ros.verification.measurement import MEASUREMENTS
 
 MERGED = {"merged": 9.0}
 RIVALS, STANDING = ("rival_near", "rival_far"), ("upright_counterparts", "unexplained")
-PAIRS = {
-    SCAN: (GOOD, BAD),
-    SUBMAP: (GOOD | MERGED, BAD | MERGED),
-    IMAGE: (GOOD_VIEWS, BAD_VIEWS),
-}
+PAIRS = {SCAN: (GOOD, BAD), SUBMAP: (GOOD | MERGED, BAD | MERGED), IMAGE: (GOOD_VIEWS, BAD_VIEWS)}
 NAN = math.nan
 
 

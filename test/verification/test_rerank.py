@@ -10,15 +10,7 @@ from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import Candidate, Keyframe, SuperFeatures
 from umf_ros.lab.evaluation.retrieval import count_superfeatures, eligible_superfeatures
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan
-from umf_ros.verification.rerank import (
-    Offered,
-    likelihoods,
-    log_ratio,
-    mutual_neighbours,
-    rerank,
-    score,
-    similarities,
-)
+from umf_ros.verification.rerank import Offered, likelihoods, log_ratio, mutual_neighbours, rerank, score, similarities
 
 GROUND = landscape(20)
 QUERY = take(GROUND, pose_at(GROUND, -14.0, 1.2, 6.0), 100.0)

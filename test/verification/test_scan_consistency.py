@@ -15,13 +15,7 @@ from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import RejectReason
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.scan_alignment import inspect
-from umf_ros.verification.scan_consistency import (
-    ambiguity,
-    beyond_walls,
-    compare_scans,
-    excess_differences,
-    repetition,
-)
+from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, compare_scans, excess_differences, repetition
 
 RNG = np.random.default_rng(5)
 UP = make_pose(np.eye(3), [0.0, 0.0, 1.5])  # the sensor on its mast

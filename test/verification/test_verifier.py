@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ground import yard_scan
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, ScanMotion
@@ -16,7 +17,7 @@ from umf_ros.detector import NOT_EMBEDDED, assemble
 from umf_ros.lab.scan_files import make_snapshot
 from umf_ros.lab.simulation.domains.pairs import is_wrong
 from umf_ros.lab.simulation.domains.survey import FIRST, OTHER_WAY, Domain, survey
-from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan, yard_scan
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image, without_scan
 from umf_ros.sensors.decode import Cloud
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const

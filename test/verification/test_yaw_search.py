@@ -2,10 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ground import yard_scan
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, make_pose, relative, rotation_angle
-from umf_ros.lab.simulation.scenes import landscape, pose_at, take, yard_scan
+from umf_ros.lab.simulation.scenes import landscape, pose_at, take
 from umf_ros.verification.pose_search import RotatedMaps, coarse_align, search
 from umf_ros.verification.prepared_scan import PreparedScan
 

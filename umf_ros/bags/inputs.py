@@ -96,7 +96,7 @@ def _remedy(name: str, bag: Bag, present: Topics) -> str:
     if not others and name == "odometry":
         return "--odometry FILE.tum supplies it, or vgicp on scans"
     if not others:
-        return f"the recording has no other {TYPES[name][0]}"
+        return f"there is no other {TYPES[name][0]}"
     return f"--set topics.{name}={others[0]}" + (f" (or {either(others[1:])})" if others[1:] else "")
 
 

@@ -90,10 +90,8 @@ def command(
         from umf_ros.bags.reader import open_bag
         from umf_ros.core.io import check_writable
         from umf_ros.core.tasks import spread
-        from umf_ros.maps.joint_graph import solve
         from umf_ros.maps.map_folder import MapFolder
         from umf_ros.maps.mapping import Opening, find_recordings, match_session, unmatched
-        from umf_ros.maps.outputs import write_results
 
         check_writable(out)
         parameters = options.parameters(config, changes)
@@ -110,9 +108,7 @@ def command(
         title = f"Matching {session.name} with the map"
         for _ in track(match_session(target, session), title, session.places, console=console, transient=True):
             pass
-    with console.status("Solving the joint graph"):
-        summary = write_results(target, solve(target))
-    _print_summary(out, summary, console)
+    _solve(target, console)
 
 
 @app.command("edit")
@@ -220,9 +216,7 @@ def import_cloud(
     from umf_ros.core.config import load_settings
     from umf_ros.detector import make_detector_embedder
     from umf_ros.maps import cloud as clouds
-    from umf_ros.maps.joint_graph import solve
     from umf_ros.maps.map_folder import MapFolder
-    from umf_ros.maps.outputs import write_results
 
     options.check_files(cloud, config, trajectory)
     if out.exists() and any(out.iterdir()):
@@ -240,9 +234,17 @@ def import_cloud(
         task = bar.add_task("Rendering places", total=len(poses) * len(headings))
         count = clouds.import_cloud(target, cloud, views, embedder, lambda: bar.advance(task))
     console.print(f"{cloud}: {len(points)} points, {count} places", markup=False, highlight=False, soft_wrap=True)
+    _solve(target, console)
+
+
+def _solve(target: MapFolder, console: Console) -> None:
+    """Solve the graph of a map, write its results and print them."""
+    from umf_ros.maps.joint_graph import solve
+    from umf_ros.maps.outputs import write_results
+
     with console.status("Solving the joint graph"):
         summary = write_results(target, solve(target))
-    _print_summary(out, summary, console)
+    _print_summary(target.path, summary, console)
 
 
 def _new_recordings(target: MapFolder, bags: list[Bag], console: Console) -> dict[str, Path]:

@@ -131,15 +131,8 @@ def command(
         if viewer:
             viewer.finish(folder)
         sensors = detector.sensors.report(read_odometry_of(folder))
-        remember_recording(
-            folder,
-            recording,
-            inputs=input_counts(reader.counters),
-            sensors=sensors.as_json(),
-            warnings=warnings,
-            interrupted=bool(interrupted()),
-            odometry_file=known_odometry,
-        )
+        facts = {"inputs": input_counts(reader.counters), "sensors": sensors.as_json(), "odometry_file": known_odometry}
+        remember_recording(folder, recording, warnings=warnings, interrupted=bool(interrupted()), **facts)
         if settings.localizing:
             status = _report_localization(console, folder, replay.counts, newest)
         else:

@@ -10,7 +10,6 @@ import typer
 from umf_ros.commands import map as maps
 from umf_ros.commands import recordings as options
 
-MapPath = Annotated[Path, typer.Option("--out", help="Folder of the map.")]
 OdometryFile = Annotated[
     Path | None, typer.Option("--odometry", help="Odometry as a TUM file; else the recording's, or that of the scans.")
 ]
@@ -18,7 +17,7 @@ OdometryFile = Annotated[
 
 def command(
     bag: options.BagPath,
-    out: MapPath = Path("slam"),
+    out: maps.MapPath = Path("slam"),
     config: options.ConfigPath = None,
     changes: options.Changes = None,
     dataset: options.DatasetName = "auto",

@@ -52,8 +52,7 @@ def delete(
 
 
 Address = Annotated[
-    str,
-    typer.Argument(help="postgresql://ADMINISTRATOR@HOST/DATABASE; the password is in ~/.pgpass or PGPASSWORD."),
+    str, typer.Argument(help="postgresql://ADMINISTRATOR@HOST/DATABASE; the password is in ~/.pgpass or PGPASSWORD.")
 ]
 
 

@@ -120,10 +120,7 @@ class EmbeddingSettings(Group):
     """Network for descriptors and local features of frames."""
 
     method: str = Field("umf", description="embedder by name: umf, or another of docs/benchmarks.md")
-    weights: str = Field(
-        "",
-        description="safetensors file; empty: umf_scene, or another method's own",
-    )
+    weights: str = Field("", description="safetensors file; empty: umf_scene, or another method's own")
     runtime: Literal["auto", "torch", "openvino"] = Field("auto", description="inference runtime")
     device: str = Field("cpu", description="torch device; half precision on a GPU")
     threads: int = Field(0, ge=0, le=64, description="threads of each of the two networks; 0: half of the cores")
@@ -180,9 +177,7 @@ class PoseGraphSettings(Group):
         0.02, gt=0, le=1, description="largest false-alarm probability of a closure accepted at once"
     )
     min_support: float = Field(
-        8.0,
-        ge=0,
-        description="evidence that closures of several places need, nats; each further place gives up to 4",
+        8.0, ge=0, description="evidence that closures of several places need, nats; each further place gives up to 4"
     )
     place_m: float = Field(10.0, ge=0, description="path length within which closures count as one place, m")
     support_range_m: float = Field(80.0, gt=0, description="path length within which closures are compared, m")
@@ -255,8 +250,7 @@ class Database(Group):
     path: str = Field("", description="file of the place database, loaded when it exists; empty: a temporary file")
     cached_keyframes: int = Field(400, ge=20, description="keyframes whose local features stay in memory")
     backend: Literal["sqlite", "postgres"] = Field(
-        "sqlite",
-        description="postgres: also push places to a fleet's server and query those of other rovers",
+        "sqlite", description="postgres: also push places to a fleet's server and query those of other rovers"
     )
     server: Annotated[str, AfterValidator(without_password)] = Field(
         "", description="fleet server, postgresql://ROVER@HOST/DATABASE; the password is in ~/.pgpass or PGPASSWORD"

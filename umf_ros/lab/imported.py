@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,7 @@ from umf_ros.lab.simulation.bag_writer import (
     pose_message,
     transforms_message,
 )
+from umf_ros.sensors.calibration import TO_BE_MEASURED
 from umf_ros.sensors.decode import CLOUD, IMAGE, TYPES, Cloud
 from umf_ros.sensors.tf import TOPIC as TRANSFORMS
 from umf_ros.sensors.tf import TYPE as TRANSFORMS_TYPE
@@ -83,6 +84,11 @@ def pose_entry(pose: Array) -> dict[str, list[float]]:
     """A pose as a calibration file has it."""
     numbers = pose[:3, 3], to_quaternion(pose)
     return dict(zip(("translation", "quaternion"), ([float(v) for v in values] for values in numbers), strict=True))
+
+
+def with_notes(notes: Iterable[str], content: dict[str, Any], flow: bool | None = None) -> str:
+    """YAML under comments; with `flow` false each value has a line of its own."""
+    return "".join(f"# {note}\n" for note in notes) + yaml.safe_dump(content, sort_keys=False, default_flow_style=flow)
 
 
 _LAYOUT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
@@ -147,10 +153,10 @@ def write_recording(found: Imported, out: Path, progress: Callable[[float], None
         for number, (stamp, topic, _, make) in enumerate(entries, 1):
             bag.write(topic, make(), stamp)
             progress(number / len(entries))
-    notes = "".join(f"# TO BE MEASURED: {what}\n" for what in found.guessed)
-    write_atomically(calibration, notes + yaml.safe_dump(found.calibration(), sort_keys=False))
+    notes = [f"{TO_BE_MEASURED}: {what}" for what in found.guessed]
+    write_atomically(calibration, with_notes(notes, found.calibration()))
     parameters = {"calibration": str(calibration.resolve()), "topics": TOPICS.model_dump()}
-    write_atomically(config, yaml.safe_dump({"/**": {"ros__parameters": parameters}}, sort_keys=False))
+    write_atomically(config, with_notes((), {"/**": {"ros__parameters": parameters}}, flow=False))
     return config
 
 
@@ -175,12 +181,8 @@ def _entries(found: Imported) -> Iterator[Entry]:
     for topic, files, right in zip(infos, cameras.values(), (False, True), strict=True):
         if files:
             camera = StereoCamera(**found.camera["camera"])
-            yield (
-                first_ns,
-                topic,
-                TYPES["left_info"][0],
-                partial(camera_info_message, camera, first_ns, "camera", right),
-            )
+            make = partial(camera_info_message, camera, first_ns, "camera", right)
+            yield first_ns, topic, TYPES["left_info"][0], make
 
 
 def _image(path: Path, stamp_ns: int) -> Any:

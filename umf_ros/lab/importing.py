@@ -18,7 +18,7 @@ import numpy as np
 from umf_ros.bags.trajectories import read_tum
 from umf_ros.core import limits
 from umf_ros.core.errors import BagError, command_line
-from umf_ros.core.geometry import Array, from_quaternion, invert
+from umf_ros.core.geometry import Array, from_quaternion, invert, make_pose
 from umf_ros.core.io import read_yaml
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.lab import lidar_sets
@@ -82,29 +82,10 @@ def entry(entries: dict[str, Array], name: str, shape: tuple[int, ...], path: Pa
     return entries[name].reshape(shape)
 
 
-def rigid(rotation: Array, translation: Array) -> Array:
-    """(4, 4) of (3, 3) and (3,)."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, np.ravel(translation)
-    return pose
-
-
 def size_of(path: Path) -> tuple[int, int]:
     """Width and height of an image."""
     height, width = read_image(path).shape
     return width, height
-
-
-def depth_of(path: Path) -> Array:
-    """(H, W) of a 16-bit depth image.
-
-    Raises:
-        SensorFileError: it is none.
-    """
-    image = read_picture(path, cv2.IMREAD_UNCHANGED)
-    if image.ndim != 2:
-        raise SensorFileError(f"{path} is no depth image")
-    return np.asarray(image, float)
 
 
 CAMERA, LIDAR = "CAM_FRONT", "LIDAR_TOP"
@@ -214,8 +195,8 @@ def kitti_raw(source: Path) -> Imported:
     cameras, lidar = source.parent / "calib_cam_to_cam.txt", source.parent / "calib_velo_to_cam.txt"
     entries, mounted = entries_of(cameras), entries_of(lidar)
     left, right = (entry(entries, f"P_rect_{name}", (3, 4), cameras) for name in ("00", "01"))
-    upright = rigid(entry(entries, "R_rect_00", (3, 3), cameras), np.zeros(3))
-    velo = rigid(entry(mounted, "R", (3, 3), lidar), entry(mounted, "T", (3,), lidar))
+    upright = make_pose(entry(entries, "R_rect_00", (3, 3), cameras), np.zeros(3))
+    velo = make_pose(entry(mounted, "R", (3, 3), lidar), entry(mounted, "T", (3,), lidar))
     found = Imported({}, invert(upright @ velo))
     found.left, found.right = (_raw_files(source / name) for name in ("image_00", "image_01"))
     found.scans = [(s, partial(read_scan, file, 4)) for s, file in _raw_files(source / "velodyne_points")]
@@ -438,7 +419,10 @@ def _listed(path: Path) -> list[tuple[int, Path]]:
 
 def _depth_scan(path: Path, matrix: Array) -> Cloud:
     """Points in the body frame of a camera that is the body."""
-    depth = depth_of(path)[::DEPTH_STEP, ::DEPTH_STEP] / DEPTH_UNITS
+    image = read_picture(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2:
+        raise SensorFileError(f"{path} is no depth image")
+    depth = image[::DEPTH_STEP, ::DEPTH_STEP] / DEPTH_UNITS
     v, u = np.nonzero((depth > 0) & (depth < FARTHEST_M))
     z = depth[v, u]
     x = (u * DEPTH_STEP - matrix[0, 2]) / matrix[0, 0] * z

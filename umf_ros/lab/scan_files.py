@@ -410,12 +410,9 @@ def read_image(path: Path) -> Image:
     Raises:
         SensorFileError: it cannot be read, or is no image.
     """
-    try:
+    image = None
+    with reading(path, SensorFileError, "cannot be read as an image"):
         image = decode_picture(path.read_bytes())
-    except OSError as error:
-        raise SensorFileError(f"cannot read {path}: {error.strerror}") from None
-    except ValueError as error:
-        raise SensorFileError(f"{path}: {error}") from None
     if image is None:
         raise SensorFileError(f"{path} is no image")
     return image

@@ -169,11 +169,7 @@ def add_session(target: MapFolder, name: str, recording: Path) -> MapSession:
 
 
 def add_places(
-    target: MapFolder,
-    name: str,
-    known: Iterable[Keyframe],
-    identity: tuple[str, int],
-    recording: dict[str, Any],
+    target: MapFolder, name: str, known: Iterable[Keyframe], identity: tuple[str, int], recording: dict[str, Any]
 ) -> MapSession:
     """Add places of a session to the map's store, on the map's clock; `map.json`, written last, makes them its own.
 

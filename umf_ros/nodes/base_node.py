@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
@@ -33,7 +33,7 @@ from umf_ros.core.errors import ConfigError, MessageError, OutputError, UmfError
 from umf_ros.core.io import check_writable
 from umf_ros.map_poses import InitialPose, MapPoses
 from umf_ros.nodes.conversions import from_time, latched, sensor_qos
-from umf_ros.nodes.diagnostics import WARN, InputWatch
+from umf_ros.nodes.diagnostics import ERROR, FAILURES, OK, WARN, InputWatch, status
 from umf_ros.nodes.parameters import changed_settings, declare, with_own_odometry
 from umf_ros.nodes.process import Worker, interruptible, log_to
 from umf_ros.sensors.calibration import Calibration
@@ -250,6 +250,8 @@ class BaseNode(LifecycleNode, ABC):
             except UmfError as error:
                 self.failure, self._starting = error, False
         if not self._opened:
+            if self._starting:
+                self._diagnose(status(WARN, "start", "not ready", {}))
             return
         self._clockless_s = self._clockless_s + WATCH_S if self._lacks_clock() else 0.0
         for watch in self._watches if 0 < self._clockless_s < CLOCK_PATIENCE_S else ():
@@ -389,9 +391,15 @@ class BaseNode(LifecycleNode, ABC):
         self.create_service(kind, name, answer, callback_group=ReentrantCallbackGroup())
 
     def _diagnose(self, own: DiagnosticStatus) -> None:
-        """Publish the health of the node and its inputs."""
-        if self._lacks_clock():
-            own.level, own.message = max(own.level, WARN), f"{own.message}; {SIM_TIME_SILENT}"
+        """Publish the health of the node, with the failures that there are, and of its inputs."""
+        failures = self._failures() if self._opened else BaseNode._failures(self)
+        found = {name: text for name, text in failures.items() if text}
+        category = next((name for name in FAILURES if name in found), "none")
+        pairs = {"failure_category": category, "remedy": FAILURES.get(category, "none")}
+        pairs["executor_stall_max_ms"] = f"{self._stall_ms:.6g}"
+        own.values += [KeyValue(key=key, value=text) for key, text in pairs.items()]
+        own.level = max(own.level, ERROR if "cannot_write" in found else WARN if found or not self._active else OK)
+        own.message = "inactive" if self._opened and not self._active else "; ".join([own.message, *found.values()])
         report = DiagnosticArray(status=[own, *(watch.status() for watch in self._watches)])
         report.header.stamp = self.get_clock().now().to_msg()
         name = self.get_fully_qualified_name().removeprefix("/")
@@ -400,14 +408,16 @@ class BaseNode(LifecycleNode, ABC):
             line.hardware_id = self.get_namespace().strip("/") or "rover"
         self._diagnostics.publish(report)
 
-    def _judge(self, own: DiagnosticStatus) -> DiagnosticStatus:
-        """Return the node's own status, degraded by silent inputs and recent faults."""
-        troubles = [watch.warning for watch in self._watches if watch.warning]
-        troubles += [f"last fault: {self._last_fault}"] if self._last_fault and self._has_fault else []
-        if troubles or not self._active:
-            own.level = max(own.level, WARN)
-            own.message = "; ".join([own.message, *troubles]) if self._active else "inactive"
-        return own
+    def _failures(self) -> dict[str, str]:
+        """Return what is wrong by category of `FAILURES`; empty texts of those that are not there."""
+        silent = {watch.name: watch.warning for watch in self._watches if watch.warning}
+        fault = "cannot_write" if self._cannot_write else "fault"
+        return {
+            "no_clock": SIM_TIME_SILENT if self._lacks_clock() else "",
+            "stale_odometry": silent.pop("odometry", ""),
+            "no_data": "its inputs are not found yet" if self._starting else "; ".join(silent.values()),
+            fault: f"last fault: {self._last_fault}" if self._last_fault and self._has_fault else "",
+        }
 
     def _report_fault(self, error: Exception, what: str = "") -> None:
         """Count a fault; log the first of each kind at once, later ones at a limited rate."""

@@ -12,13 +12,27 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import qos_profile_sensor_data
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import Image
 
 from umf_ros.sensors.topic_finder import is_own
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+FAILURES = {
+    "cannot_write": "make room for results_dir, or name another folder",
+    "no_clock": "start the player or the simulator, or set use_sim_time to false",
+    "no_data": "start the drivers, or name their topics: umf doctor --live finds them",
+    "no_calibration": "publish /tf_static and camera_info, or name a file: calibration",
+    "stale_odometry": "start the odometry, or make it from the scans: odometry.engine",
+    "contradicting_sensors": "correct the mounting, clock or driver that the message names",
+    "lost_odometry": "name another odometry: the scans show too little of its way",
+    "overload": "raise keyframe.min_translation_m, or take load off the processor",
+    "weak_overlap": "drive where the map was made, or give a pose on /initialpose",
+    "fault": "read the log of the node, which continues",
+}
+"""Remedy by category of failures; where there are several, the first counts."""
+TOO_SLOW = "too slow: messages are being dropped"
 SILENT_S = 5.0
 """Silence of an input that is reported, by the machine's clock."""
 
@@ -84,10 +98,7 @@ class InputWatch:
             return status(OK, f"input {self.name}", f"{rate:.1f} Hz", values)
         publishers = self._node.get_publishers_info_by_topic(self.topic)
         values["publishers"] = len(publishers)
-        values["publisher_qos"] = ", ".join(
-            "reliable" if info.qos_profile.reliability == QoSReliabilityPolicy.RELIABLE else "best effort"
-            for info in publishers
-        )
+        values["publisher_qos"] = ", ".join(one.qos_profile.reliability.name.lower() for one in publishers)
         if self._rare and any(info.topic_type == self._type for info in publishers):
             return status(OK, f"input {self.name}", f"{self.received} received", values)
         reason = self._reason(publishers, silent_s)

@@ -34,7 +34,7 @@ from umf_ros.map_poses import InitialPose, MapPoses, PoseHint
 from umf_ros.nodes import conversions as messages
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, MAX_LINES, SCAN_FIELDS
-from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
+from umf_ros.nodes.diagnostics import ERROR, OK, TOO_SLOW, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.nodes.scan_odometry import LOST, SCANS, start_engine
 from umf_ros.runs.run_file import as_stored
@@ -54,6 +54,8 @@ DECODE_S = 0.5
 """Longest time at the end for waiting messages, and as long again for the one in hand."""
 RESUME = "played again into a node with the same results_dir and database.path, they continue the run"
 SCAN_DEPTH = 50
+UNPLACED = {"transforms", "camera_info", "size"}
+"""Reasons why a message is dropped where the calibration is missing or another one."""
 MESSAGE_TYPES = {"cloud": PointCloud2, "odometry": Odometry}
 MESSAGE_TYPES |= dict.fromkeys(("left_image", "right_image"), Image)
 MESSAGE_TYPES |= dict.fromkeys(("left_info", "right_info"), CameraInfo)
@@ -202,8 +204,7 @@ class LoopClosureNode(BaseNode):
         return count_drops(self._synchronizer.counters, self._worker.dropped + self._decoder.dropped)
 
     def _tick(self) -> None:
-        own = self._own_status()
-        self._diagnose(own if self._paused else self._judge(own))
+        self._diagnose(self._own_status())
         self._writer.submit(None)  # a slow disk must not block the executor
 
     def _write_summary(self) -> None:
@@ -221,26 +222,29 @@ class LoopClosureNode(BaseNode):
             "lag_s": lag_s,
             "memory_mb": memory_mb(),
             "last_error": self._last_fault or "none",
-            "executor_stall_max_ms": self._stall_ms,
             **{f"fault_{kind}": count for kind, count in self._faults.items()},
             **{f"dropped_{name}": count for name, count in self._drops().items()},
             **_counts(self._synchronizer),
             **self._engine_counts,
             **self._fleet(),
         }
-        level, text = OK, f"{self._closures} closures among {len(self._detector.database)} places"
-        if self._paused:
-            level, text = WARN, "paused"
-        elif self._cannot_write:
-            level = ERROR
-        elif self._detector.sensors.contradictions:
-            level, text = ERROR, f"{WITHHELD}: {self._detector.sensors.contradictions[0].what}"
-        elif self._engine_counts[LOST] > max(1, MAX_LOST * self._engine_counts[SCANS]):
-            lost = f"{self._engine_counts[LOST]} of {self._engine_counts[SCANS]} scans"
-            level, text = WARN, f"{self._settings.odometry.engine} lost track of {lost}: it sees too little of its way"
-        elif self._worker.dropped or self._decoder.dropped:
-            level, text = WARN, "too slow: messages are being dropped"
+        text = "paused" if self._paused else f"{self._closures} closures among {len(self._detector.database)} places"
+        level = ERROR if self._detector.sensors.contradictions else WARN if self._paused else OK
         return status(level, "detector", text, values)
+
+    def _failures(self) -> dict[str, str]:
+        if self._paused:
+            return {}
+        known, counts = self._detector.sensors.contradictions, self._engine_counts
+        is_lost = counts[LOST] > max(1, MAX_LOST * counts[SCANS])
+        inputs = self._synchronizer.counters.items()
+        unplaced = [name for name, one in inputs if not one.used and any(kind in one.dropped for kind in UNPLACED)]
+        return super()._failures() | {
+            "contradicting_sensors": f"{WITHHELD}: {known[0].what}" if known else "",
+            "lost_odometry": f"the engine lost track of {counts[LOST]} of {counts[SCANS]} scans" if is_lost else "",
+            "overload": TOO_SLOW if self._worker.dropped or self._decoder.dropped else "",
+            "no_calibration": f"no message of {' and '.join(unplaced)} fits the calibration" if unplaced else "",
+        }
 
     def _fleet(self) -> dict[str, Any]:
         """Return the state of the link to the fleet's server, if there is one."""

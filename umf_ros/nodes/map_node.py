@@ -21,7 +21,7 @@ from umf_ros.core.errors import MessageError, UmfError
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.nodes.base_node import BaseNode
 from umf_ros.nodes.conversions import LATCHED_QOS, SCAN_FIELDS, from_time, to_cloud, to_header
-from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
+from umf_ros.nodes.diagnostics import OK, TOO_SLOW, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.sensors.decode import OdometrySample, decode_pose, stamp_ns
 from umf_ros.sensors.topic_finder import BACK_END
@@ -89,7 +89,7 @@ class MapNode(BaseNode):
         wanted = wanted or any(publisher.get_subscription_count() for publisher in self._publishers_of.values())
         if wanted and time.monotonic() >= self._due_s:
             self._worker.submit(self._show, needed=True, once=True)
-        self._diagnose(self._judge(self._own_status()))
+        self._diagnose(self._own_status())
 
     def _update(self) -> None:
         path, self._path = self._path, None
@@ -135,6 +135,9 @@ class MapNode(BaseNode):
             raise UmfError("nothing to write: no scan has a place in the map yet")
         return f"written to {folder}: {write_terrain(folder, points, self._settings.terrain)}"
 
+    def _failures(self) -> dict[str, str]:
+        return super()._failures() | {"overload": TOO_SLOW if self._worker.dropped else ""}
+
     def _own_status(self) -> DiagnosticStatus:
         scans, odometry = self._map.kept
         values = {
@@ -148,10 +151,8 @@ class MapNode(BaseNode):
             "grid_cropped_to": self._cropped,
             "bytes_published": self._bytes,
             "queue_dropped": self._worker.dropped,
-            "executor_stall_max_ms": self._stall_ms,
         }
-        level = ERROR if self._cannot_write else WARN if self._worker.dropped or self._faults else OK
-        return status(level, "map", f"{self._map.voxels.scans} keyframes in the map", values)
+        return status(WARN if self._faults else OK, "map", f"{self._map.voxels.scans} keyframes in the map", values)
 
 
 def to_grid(grid: TerrainGrid, header: Any) -> OccupancyGrid:

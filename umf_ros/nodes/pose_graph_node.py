@@ -33,7 +33,7 @@ from umf_ros.map_poses import InitialPose, MapPoses
 from umf_ros.nodes import conversions as messages
 from umf_ros.nodes.base_node import ODOMETRY_DEPTH, BaseNode
 from umf_ros.nodes.conversions import CLOSURES_QOS, LATCHED_QOS, parse_pair
-from umf_ros.nodes.diagnostics import ERROR, OK, WARN, status
+from umf_ros.nodes.diagnostics import OK, TOO_SLOW, WARN, status
 from umf_ros.nodes.process import Worker, leave, run
 from umf_ros.pose_graph.closures import ClosureVerdict, State
 from umf_ros.runs.run_file import GraphInput
@@ -291,7 +291,7 @@ class PoseGraphNode(BaseNode):
 
     def _tick(self) -> None:
         self._worker.submit(self._update, needed=True, once=True)
-        self._diagnose(self._judge(self._own_status()))
+        self._diagnose(self._own_status())
 
     def _update(self) -> None:
         """Decide about closures whose odometry has arrived, and publish the new path."""
@@ -305,19 +305,25 @@ class PoseGraphNode(BaseNode):
 
     def _own_status(self) -> DiagnosticStatus:
         state = self._state
-        values: dict[str, object] = {**state.counts, **self._faults, "queue_dropped": self._inbox_dropped}
-        values["queue_waiting"] = len(self._inbox)
-        values["executor_stall_max_ms"] = self._stall_ms
-        trouble = self._inbox_dropped or any(name.startswith("optimiser") for name in state.counts)
-        trouble = trouble or any("as a whole" in name for name in state.counts)
+        values: dict[str, object] = {**state.counts, **self._faults}
+        values |= {"queue_dropped": self._inbox_dropped, "queue_waiting": len(self._inbox)}
         text = f"{values.get('accepted', 0)} closures accepted"
         if state.probability is not None:
             values["probability"] = state.probability
             text = "in the map" if state.map_T_odom is not None else "not localised in the map yet"
-        if values.get("pending") and state.newest_ns < 0:
-            trouble, text = True, f"{values['pending']} closures pending: no odometry received"
-        level = ERROR if self._cannot_write else WARN if trouble or self._has_fault else OK
+        level = WARN if any(name.startswith("optimiser") for name in state.counts) else OK
         return status(level, "pose graph", text, values)
+
+    def _failures(self) -> dict[str, str]:
+        found, state = super()._failures(), self._state
+        is_found = state.probability is None or state.map_T_odom is not None
+        if (pending := state.counts.get("pending")) and state.newest_ns < 0:
+            found["stale_odometry"] = f"{pending} closures pending: no odometry received"
+        return found | {
+            "weak_overlap": "" if is_found or state.newest_ns < 0 else "no place of the map was found so far",
+            "overload": TOO_SLOW if self._inbox_dropped else "",
+            "contradicting_sensors": "; ".join(f"{k}: {v}" for k, v in state.counts.items() if "as a whole" in k),
+        }
 
     def _reject_last(self) -> str:
         accepted = [one.closure for one in self._durable.closures() if one.state is State.ACCEPTED]

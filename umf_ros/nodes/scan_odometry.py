@@ -29,11 +29,7 @@ WAITING, KEPT = 10, 20
 
 
 def start_engine(
-    node: Node,
-    settings: Settings,
-    calibration: Calibration,
-    frames: BodyFrames,
-    on_error: Callable[[Exception], None],
+    node: Node, settings: Settings, calibration: Calibration, frames: BodyFrames, on_error: Callable[[Exception], None]
 ) -> tuple[Worker[Any], Counter[str]]:
     """Return a thread that takes scans and publishes `~/odometry`, and its counts; it publishes no transform."""
     cloud, warn = topics_of(settings).cloud, node.get_logger().warning

@@ -25,15 +25,7 @@ from umf_ros.pose_graph.closures import State
 from umf_ros.runs.findings import RunVerdict, conclude, judge, look_first
 from umf_ros.runs.reader import TRUTH, FinishedRun
 from umf_ros.runs.run_file import NAME, read_inliers
-from umf_ros.runs.scene import (
-    build_scene,
-    by_need,
-    data_address,
-    drawn_trajectory,
-    pairs_of,
-    read_pictures,
-    size_of,
-)
+from umf_ros.runs.scene import build_scene, by_need, data_address, drawn_trajectory, pairs_of, read_pictures, size_of
 from umf_ros.runs.self_check import TABLE, check_run
 from umf_ros.runs.truth import MEDIAN_EXPECTED, JudgedRun, in_words
 from umf_ros.sensors.sensor_check import SensorReport
@@ -180,11 +172,7 @@ MAX_SHOWN = 400
 
 
 def finish_run(
-    run: FinishedRun,
-    bag: Bag,
-    console: Console,
-    sensors: SensorReport,
-    printed: frozenset[str] = frozenset(),
+    run: FinishedRun, bag: Bag, console: Console, sensors: SensorReport, printed: frozenset[str] = frozenset()
 ) -> RunVerdict:
     """Judge a run, write its report, print its summary, and return the verdict.
 

@@ -37,11 +37,7 @@ def verdict(query: Frame, match: Frame, error_m: float, probability: float) -> H
     pose = relative(*poses) @ make_pose(np.eye(3), [0, error_m, 0])
     closure = LoopClosure(query.stamp_ns, match.stamp_ns, pose, np.eye(6) * 0.01, probability)
     return Hypothesis(
-        query.stamp_ns,
-        Candidate(0, match.stamp_ns, 0.8),
-        {"similarity": 0.8},
-        closure=closure,
-        inlier_pixels=PIXELS,
+        query.stamp_ns, Candidate(0, match.stamp_ns, 0.8), {"similarity": 0.8}, closure=closure, inlier_pixels=PIXELS
     )
 
 

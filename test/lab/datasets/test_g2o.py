@@ -8,17 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from graph_worlds import (
-    LAP,
-    SETTINGS,
-    accepted,
-    closing,
-    content_of,
-    driven_file,
-    lap_pairs,
-    rms,
-    two_laps,
-)
+from graph_worlds import LAP, SETTINGS, accepted, closing, content_of, driven_file, lap_pairs, rms, two_laps
 
 from umf_ros.core.errors import GraphError, OutputError
 from umf_ros.core.geometry import adjoint, expmap, heading, invert, make_pose, propagate, relative

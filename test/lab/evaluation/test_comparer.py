@@ -13,13 +13,7 @@ from recordings import CALIBRATION
 from umf_ros.baselines.handcrafted import ThumbnailEmbedder
 from umf_ros.core.config import Verification
 from umf_ros.core.geometry import make_pose
-from umf_ros.lab.evaluation.comparison import (
-    NO_CALIBRATION,
-    NO_DEPTH,
-    Comparer,
-    judge,
-    similarity_of,
-)
+from umf_ros.lab.evaluation.comparison import NO_CALIBRATION, NO_DEPTH, Comparer, judge, similarity_of
 from umf_ros.lab.evaluation.place_views import PlaceView, ViewReader
 from umf_ros.lab.scan_files import SensorFileError
 from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_image

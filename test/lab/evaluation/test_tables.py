@@ -11,14 +11,7 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import from_quaternion, make_pose
-from umf_ros.lab.evaluation.comparison import (
-    POSE,
-    RESULT_COLUMNS,
-    SIGMA,
-    read_pairs,
-    result_row,
-    view_row,
-)
+from umf_ros.lab.evaluation.comparison import POSE, RESULT_COLUMNS, SIGMA, read_pairs, result_row, view_row
 from umf_ros.lab.evaluation.place_views import PlaceView
 
 

@@ -388,10 +388,7 @@ def test_the_command_knows_every_format() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["waymo", ".", "a.mcap"],
-            "unknown kind 'waymo'; expected kitti-odometry, kitti-raw, euroc",
-        ),
+        (["waymo", ".", "a.mcap"], "unknown kind 'waymo'; expected kitti-odometry, kitti-raw, euroc"),
         (["folder", "nowhere", "a.mcap"], "there is no folder nowhere"),
         (["folder", "{empty}", "a.bag"], "the name must end in .mcap"),
         (["folder", "{empty}", "a.mcap"], "times.txt"),

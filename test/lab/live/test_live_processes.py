@@ -17,7 +17,7 @@ from recordings import traverse, write_mcap
 from rich.console import Console
 
 from umf_ros.core.errors import UmfError
-from umf_ros.lab.live.live_graph import PLAYER, LiveGraph, NodeProcess
+from umf_ros.lab.live.live_graph import LiveGraph, NodeProcess
 
 SCANS = 14
 RESULTS = ["summary.json", "closures.csv", "keyframes.csv", "config.yaml", "graph.g2o", "trajectory_odometry.tum"]
@@ -73,16 +73,6 @@ def test_a_program_that_ends_before_it_is_ready_is_told_with_its_log(tmp_path: P
     assert process.stop() and process.exit_code == 0
     assert len(lines) == 1 and lines[0].startswith("an image arrived after")
     assert (tmp_path / "diagnostics.log").read_text() == lines[0] + "\n"
-
-
-def test_what_a_program_complains_of_is_shown_and_logged(tmp_path: Path) -> None:
-    lines: list[str] = []
-    process = NodeProcess(PLAYER, ["nowhere.mcap"], tmp_path, lines.append)
-    with pytest.raises(UmfError, match="bag_player_node ended with status 1"):
-        process.wait_ready()
-    process.stop()
-    assert lines == ["umf: there is no recording nowhere.mcap"]
-    assert (tmp_path / "bag_player_node.log").read_text() == "umf: there is no recording nowhere.mcap\n"
 
 
 def test_a_node_runs_in_a_session_of_its_own_until_it_is_stopped(tmp_path: Path) -> None:

@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 from measurements import BAD, BAD_VIEWS, GOOD
 
-from umf_ros.lab.fit.acceptance import (
-    Example,
-    bounds_of,
-    fit_covariance,
-    fit_decision,
-    fit_logistic,
-    scale_covariance,
-)
+from umf_ros.lab.fit.acceptance import Example, bounds_of, fit_covariance, fit_decision, fit_logistic, scale_covariance
 from umf_ros.lab.fit.scan_acceptance import fit
 from umf_ros.runs.truth import normalised_errors, share_inside
 from umf_ros.verification.acceptance import load_acceptance, scores

@@ -73,8 +73,7 @@ def optimize(
 
 @app.command()
 def plot(
-    file: File,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Picture to write.")] = Path("graph.png"),
+    file: File, output: Annotated[Path, typer.Option("--output", "-o", help="Picture to write.")] = Path("graph.png")
 ) -> None:
     """Draw a graph file: odometry dark, closures green, from above and from the side."""
     from umf_ros.lab.datasets.g2o import read_g2o

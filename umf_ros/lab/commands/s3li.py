@@ -11,6 +11,7 @@ from umf_ros.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import TaskID
 
     from umf_ros.lab.datasets.s3li_folder import S3liFolder
     from umf_ros.lab.evaluation.s3li_run import Record, S3liRun
@@ -86,11 +87,10 @@ def _told(records: dict[str, Record]) -> list[str]:
 
 def _run(run: S3liRun, download: S3liFolder, console: Console) -> list[str]:
     """Replay and retrieve with a bar over all sequences; returns lines about what was left out."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+    from umf_ros.lab.commands.simulate import counted_progress
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     left_out: list[str] = []
-    with Progress(*columns, console=console, transient=True) as progress:
+    with counted_progress(console) as progress:
         bar = progress.add_task("replaying", total=len(download.sequences))
         for number, one in enumerate(download.sequences):
             progress.update(bar, description=one.name)

@@ -127,7 +127,7 @@ def _write_twin(
     if unknown:
         raise ConfigError(f"S3LI has no sequence {unknown[0]!r}; expected {', '.join(one.name for one in TWINS)}")
     started = time.monotonic()
-    with _progress(console) as progress:
+    with counted_progress(console) as progress:
         task = progress.add_task("building the world", total=len(names) or len(TWINS))
         finished: list[str] = []
 
@@ -162,7 +162,7 @@ def write_drive(
     if out.suffix != ".mcap":
         raise OutputError(f"cannot write {out}: the name must end in .mcap")
     chosen = find_preset(preset)
-    with BagWriter(out) as bag, _progress(console) as progress:
+    with BagWriter(out) as bag, counted_progress(console) as progress:
         task = progress.add_task("building the world", total=None)
         simulator = Simulator(chosen, seeds[0], duration, image_rate, family, aliasing, seeds[1])
         progress.update(task, description="simulating scans", total=len(simulator.scan_stamps_ns))
@@ -179,7 +179,7 @@ def _write_sequences(folder: Path, sequences: str, seed: int, workers: int, cons
 
     if sequences not in SEQUENCES:
         raise ConfigError(f"unknown sequences {sequences!r}; expected one of {', '.join(SEQUENCES)}")
-    with _progress(console) as progress:
+    with counted_progress(console) as progress:
         for name, survey in SEQUENCES[sequences](seed):
             path = folder / f"{name}.npz"
             if not path.exists():
@@ -192,7 +192,7 @@ def _write_worlds(folder: Path, worlds: str, every: int, workers: int, ray: str 
     from umf_ros.lab.simulation.survey import missing_worlds, seed_range, write_world
 
     missing = missing_worlds(folder, seed_range(worlds), every)
-    with _progress(console) as progress:
+    with counted_progress(console) as progress:
         task = progress.add_task("worlds", total=len(missing))
         spread(write_world, missing, workers, ray, partial(_advance, progress, task))
 
@@ -210,7 +210,8 @@ def _write_contact_sheet(path: Path, seed: int, family: str, console: Console) -
     console.print(f"{path}: {what}", markup=False, soft_wrap=True)
 
 
-def _progress(console: Console) -> Progress:
+def counted_progress(console: Console) -> Progress:
+    """Return a transient bar of how many are done."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

@@ -34,13 +34,9 @@ BODY_T_CAMERA = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 
 
 class TrainingTuple:
-    """Stands for MinkLoc++'s class of that name; its attributes are those of the pickle."""
+    """Stands for MinkLoc++'s class of that name; of the attributes in the pickle these are read."""
 
-    id: int
-    timestamp: int
     rel_scan_filepath: str
-    positives: Any
-    non_negatives: Any
     position: Any
 
 

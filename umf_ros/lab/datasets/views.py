@@ -14,15 +14,7 @@ from scipy.spatial.transform import Rotation
 from umf_ros.core.frames import Frame, Image, Points
 from umf_ros.core.geometry import Array, invert, make_pose, transform
 from umf_ros.core.levelling import level
-from umf_ros.embedding.inputs import (
-    VoxelScan,
-    is_blank,
-    pack,
-    prepare_image,
-    prepare_scan,
-    shrink,
-    standardise,
-)
+from umf_ros.embedding.inputs import VoxelScan, is_blank, pack, prepare_image, prepare_scan, shrink, standardise
 from umf_ros.lab.datasets.sample import Sample
 from umf_ros.networks.config import NetworkConfig, NetworkInput
 

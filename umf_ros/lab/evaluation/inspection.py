@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.inputs import Advice, absent_inputs, input_counts, present_topics, useless_inputs
@@ -18,9 +19,8 @@ from umf_ros.bags.reader import Bag, decode
 from umf_ros.core.config import AUTO, ParameterSource, Settings, Topics, load_preset, load_settings
 from umf_ros.core.errors import BagError, MessageError, UmfError, command_line, either, printable
 from umf_ros.core.frames import Frame
-from umf_ros.core.geometry import Array, to_quaternion
 from umf_ros.core.trajectory import Trajectory, bracket
-from umf_ros.lab.imported import OPTICAL
+from umf_ros.lab.imported import OPTICAL, pose_entry, with_notes
 from umf_ros.runs.findings import gap_remedy
 from umf_ros.sensors.calibration import TO_BE_MEASURED, load_calibration
 from umf_ros.sensors.decode import OdometrySample, decode_camera_info, decode_cloud, decode_image, decode_pose, stamp_ns
@@ -35,9 +35,11 @@ FRAMES = 20
 FEW_PAIRS = 0.5
 """Share of the scans with an image, by hand, below which something is wrong."""
 
+LATE_S = 0.5
+"""By hand: difference between the delays of two sensors that is reported; a scan takes up to 0.2 s."""
+ENGINE = "vgicp"
 BODIES = ("base_link", "base_footprint", "body", "imu_link")
-GUESS = f"{TO_BE_MEASURED}: a guess"
-RAW = "  # the images look raw: rectify them, or see raw_camera in config/calibration/s3li_vulcano.yaml"
+RAW = "camera: the images look raw: rectify them, or see raw_camera in config/calibration/s3li_vulcano.yaml"
 
 
 @dataclass
@@ -51,6 +53,7 @@ class Inspected:
         unknown: why a replay needs such a file; empty where it does without.
         found: words about each input, by its name in `Topics`, and about `pairs` of scan and image.
         messages: the first usable one of each input, by its name in `Topics`; of the first topic where several fit.
+        is_live: whether the topics are those of a running robot.
         advice: what is wrong or missing, with what helps.
     """
 
@@ -60,6 +63,7 @@ class Inspected:
     unknown: str = ""
     found: dict[str, str] = field(default_factory=dict)
     messages: dict[str, Any] = field(default_factory=dict)
+    is_live: bool = False
     advice: list[Advice] = field(default_factory=list)
 
     @property
@@ -68,24 +72,28 @@ class Inspected:
         return next((one for one in self.advice if one.severity == "fault"), None)
 
 
-def inspect(bag: Bag, source: ParameterSource = None, for_file: bool = False) -> Inspected:
+def inspect(bag: Bag, source: ParameterSource = None, for_file: bool = False, is_live: bool = False) -> Inspected:
     """Look at a recording as a replay with these parameters would: its topics, their messages, and the first frames.
 
-    `for_file` takes topics by their type also where the recording lacks those of its data set, to write them.
+    `for_file` takes topics by their type also where the recording lacks those of its data set, to write them. Some
+    seconds of a running robot (`is_live`) may be too short for a closure.
 
     Raises:
         ConfigError: the parameters are wrong.
     """
     found = _settings_of(bag, source)
+    found.is_live = is_live
     if for_file:
         by_type = find_topics(bag.types)[0].model_dump().items()
-        lacking = {name: topic for name, topic in by_type if not getattr(found.topics, name)}
+        named = load_settings(source).topics.model_fields_set
+        lacking = {name: topic for name, topic in by_type if name not in named and not getattr(found.topics, name)}
         found.topics = found.topics.model_copy(update=lacking)
     for name, fits in found.ambiguous.items():
-        command = command_line("inspect", bag.path, "--set", f"topics.{name}={fits[0]}")
+        again = ("doctor", "--live") if is_live else ("inspect", bag.path)
+        command = command_line(*again, "--set", f"topics.{name}={fits[0]}")
         found.advice.append(Advice("fault", f"several topics fit {name}: {either(fits)}", f"name one: {command}"))
     _read_samples(bag, found)
-    for rule in (_about_inputs, _about_frames, _about_odometry, _about_pairs, _about_gaps):
+    for rule in (_about_inputs, _about_frames, _about_odometry, _about_pairs, _about_clocks, _about_gaps):
         found.advice += rule(bag, found)
     return found
 
@@ -201,12 +209,25 @@ def _about_odometry(bag: Bag, found: Inspected) -> Iterator[Advice]:
     if not found.topics.odometry:
         imu = [topic for topic, info in bag.topics.items() if info.type == "sensor_msgs/msg/Imu"]
         also = f"; {imu[0]} is an IMU, which is no odometry" if imu else ""
-        if found.topics.cloud:
+        if found.topics.cloud and found.is_live:
+            made = f"loop_closure_node makes it from {found.topics.cloud} (odometry.engine: {ENGINE})"
+            yield Advice("note", f"no odometry{also}: {made}")
+        elif found.topics.cloud:
             what = f"no odometry{also}: umf replay, umf slam and umf map make it from {found.topics.cloud} (vgicp)"
             yield Advice("note", what, "--odometry FILE.tum takes that of another system")
-            return
-        remedy = "run one (Basalt on the images) and give its poses with --odometry FILE.tum"
-        yield Advice("warning", f"no odometry: closures only, the pose graph is skipped{also}", remedy)
+        else:
+            remedy = "publish its poses" if found.is_live else "give its poses with --odometry FILE.tum"
+            what = f"no odometry: closures only, the pose graph is skipped{also}"
+            yield Advice("warning", what, f"run one (Basalt on the images) and {remedy}")
+
+
+def _stamps(bag: Bag, topics: Collection[str]) -> dict[str, NDArray[np.int64]]:
+    """Return (N, 2) stamps and times of recording in ns, by topic of messages with a header."""
+    found: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics if topic}
+    for raw in bag.raw_messages(list(found)):
+        seconds, nanoseconds = struct.unpack_from("<iI" if raw.data[1] & 1 else ">iI", raw.data, 4)
+        found[raw.topic].append((seconds * 10**9 + nanoseconds, raw.log_ns))
+    return {topic: np.array(rows, np.int64) for topic, rows in found.items()}
 
 
 def _about_pairs(bag: Bag, found: Inspected) -> Iterator[Advice]:
@@ -214,12 +235,8 @@ def _about_pairs(bag: Bag, found: Inspected) -> Iterator[Advice]:
     topics, slop_s = found.topics, found.settings.sync.slop_s
     if not topics.left_image or not topics.cloud:
         return
-    stamps: dict[str, list[int]] = {topics.left_image: [], topics.cloud: []}
-    for raw in bag.raw_messages([topics.left_image, topics.cloud]):
-        seconds, nanoseconds = struct.unpack_from("<iI" if raw.data[1] & 1 else ">iI", raw.data, 4)
-        stamps[raw.topic].append(seconds * 10**9 + nanoseconds)
-    scans = np.array(stamps[topics.cloud])
-    images = np.sort(stamps[topics.left_image])
+    stamps = _stamps(bag, (topics.left_image, topics.cloud))
+    scans, images = stamps[topics.cloud][:, 0], np.sort(stamps[topics.left_image][:, 0])
     before, after, _ = bracket(images, scans)
     away_ns = np.minimum(np.abs(scans - images[before]), np.abs(scans - images[after]))
     pairs, median_s = int((away_ns <= slop_s * 1e9).sum()), float(np.median(away_ns)) * 1e-9
@@ -230,9 +247,21 @@ def _about_pairs(bag: Bag, found: Inspected) -> Iterator[Advice]:
         yield Advice("warning" if pairs else "fault", what, "two clocks? sync.slop_s, or the driver's stamps")
 
 
+def _about_clocks(bag: Bag, found: Inspected) -> Iterator[Advice]:
+    """Compare how long after their stamps the messages of a running robot arrive."""
+    inputs = [topic for name, topic in found.topics.model_dump().items() if not name.endswith("info")]
+    stamps = _stamps(bag, inputs) if found.is_live else {}
+    late_s = {topic: float(np.median(rows[:, 1] - rows[:, 0])) * 1e-9 for topic, rows in stamps.items()}
+    first = min(late_s, key=lambda topic: late_s[topic], default="")
+    for topic, delay_s in late_s.items():
+        if (behind_s := delay_s - late_s[first]) > LATE_S:
+            what = f"stamps of {topic} are {behind_s:.1f} s behind those of {first}"
+            yield Advice("warning", what, "two clocks? synchronise them, or correct the driver's stamps")
+
+
 def _about_gaps(bag: Bag, found: Inspected) -> Iterator[Advice]:
     settings = found.settings
-    if bag.duration_s < settings.loop.min_time_gap_s:
+    if bag.duration_s < settings.loop.min_time_gap_s and not found.is_live:
         gap = f"loop.min_time_gap_s, {settings.loop.min_time_gap_s:g} s"
         what = f"{bag.duration_s:.1f} s are shorter than {gap}: no match is allowed"
         remedy = gap_remedy(bag.duration_s, None if found.topics.odometry else 0.0, settings)
@@ -241,15 +270,13 @@ def _about_gaps(bag: Bag, found: Inspected) -> Iterator[Advice]:
 
 def write_settings(found: Inspected, calibration: str) -> str:
     """A first parameter file: the topics, and the calibration beside it; an input without a topic is left out by ""."""
-    defaults = Topics().model_dump()
-    lines = ["# What umf inspect found; docs/parameters.md lists everything that may stand here.", "/**:"]
-    lines += ["  ros__parameters:", f"    calibration: {calibration}", "    topics:"]
-    for name, topic in found.topics.model_dump().items():
-        if name in found.ambiguous:
-            lines.append(f"      # {name}: one of {', '.join(found.ambiguous[name])}")
-        elif topic or defaults[name]:
-            lines.append(f'      {name}: "{topic}"')
-    return "\n".join(lines) + "\n"
+    notes = ["Found by umf inspect; docs/parameters.md lists everything that may stand here."]
+    notes += [f"topics.{name}: one of {', '.join(fits)}" for name, fits in found.ambiguous.items()]
+    topics = {name: topic for name, topic in found.topics.model_dump().items() if name not in found.ambiguous}
+    parameters: dict[str, Any] = {"calibration": calibration, "topics": topics}
+    if found.topics.cloud and not found.topics.odometry:
+        parameters["odometry"] = {"engine": ENGINE}
+    return with_notes(notes, {"/**": {"ros__parameters": parameters}}, flow=False)
 
 
 def calibration_of_dataset(found: Inspected, bag: Bag) -> Path | None:
@@ -268,47 +295,38 @@ def write_calibration(found: Inspected, transforms: StaticTransforms) -> str:
 
     It has entries of the sensors that the recording has.
     """
-    lines = ["# Written by umf inspect. Metres, quaternions x y z w; poses in the body frame (x ahead, y left, z up)."]
     frames = {name: printable(message.header.frame_id) for name, message in found.messages.items()}
     named = [frames[name] for name in ("cloud", "left_image") if frames.get(name)]
     bodies = [body for frame in named for body in BODIES if transforms.find(body, frame) is not None]
-    body = bodies[0] if bodies else ""
+    notes = ["Written by umf inspect. Metres, quaternions x y z w; poses in the body frame (x ahead, y left, z up)."]
+    entries: dict[str, Any] = {}
+    if "left_image" in frames:
+        entries["camera"], note = _camera(found)
+        notes += [note] if note else []
     for key, name, usual in (("body_T_camera", "left_image", OPTICAL), ("body_T_lidar", "cloud", np.eye(4))):
-        if name not in frames:
-            continue
-        lines += _camera_lines(found) if name == "left_image" else []
-        known = transforms.find(body, frames[name]) if body and frames[name] else None
-        note = f"of {frames[name]} in {body}, from {TOPIC}" if known is not None else GUESS
-        lines += _pose_lines(key, usual if known is None else known, note)
-    lines += _pose_lines("body_T_imu", np.eye(4), "only for --odometry-frame imu")
-    lines += ["lidar_time_offset_s: 0.0  # from a scan's stamp to the moment its points are brought to"]
-    lines += ["min_intensity: 0", "max_height_m: 0  # both off"]
-    return "\n".join(lines) + "\n"
+        if name in frames:
+            known = transforms.find(bodies[0], frames[name]) if bodies and frames[name] else None
+            source = f"{key}: of {frames[name]} in {bodies[0]}, from {TOPIC}" if known is not None else ""
+            notes.append(source or f"{TO_BE_MEASURED}: {key}")
+            entries[key] = pose_entry(usual if known is None else known)
+    offsets = {"lidar_time_offset_s": 0.0, "min_intensity": 0.0, "max_height_m": 0.0}
+    return with_notes(notes, entries | {"body_T_imu": pose_entry(np.eye(4))} | offsets)
 
 
-def _camera_lines(found: Inspected) -> list[str]:
+def _camera(found: Inspected) -> tuple[dict[str, Any], str]:
+    """Return the entry `camera` of a calibration and a note about it."""
     left, right = (found.messages.get(name) for name in ("left_info", "right_info"))
+    names = ("width", "height", "fx", "fy", "cx", "cy", "baseline")
     if left is None:
         height, width = decode_image(found.messages["left_image"]).shape
-        focal = 0.8 * width
-        numbers = {"width": width, "height": height, "fx": focal, "fy": focal, "cx": width / 2, "cy": height / 2}
-        return [f"camera:  # {GUESS}", *_mapping(numbers | {"baseline": 0.0})]
+        numbers = width, height, 0.8 * width, 0.8 * width, width / 2, height / 2, 0.0
+        return dict(zip(names, numbers, strict=True)), f"{TO_BE_MEASURED}: camera"
     try:
         camera = decode_camera_info(left, right)
     except MessageError:
         camera = decode_camera_info(left)
-    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "baseline")}
     raw = np.any(np.asarray(left.d, float)) and "rect" not in found.topics.left_image
-    return [f"camera:{RAW if raw else ''}", *_mapping(numbers)]
-
-
-def _mapping(numbers: dict[str, float]) -> list[str]:
-    return [f"  {name}: {value:.10g}" for name, value in numbers.items()]
-
-
-def _pose_lines(name: str, pose: Array, note: str) -> list[str]:
-    shift, turn = ([f"{value:.9g}" for value in values] for values in (pose[:3, 3], to_quaternion(pose)))
-    return [f"{name}:  # {note}", f"  translation: [{', '.join(shift)}]", f"  quaternion: [{', '.join(turn)}]"]
+    return {name: getattr(camera, name) for name in names}, RAW if raw else ""
 
 
 def check_sensors(

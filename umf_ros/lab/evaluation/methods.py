@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import matplotlib
@@ -50,19 +50,9 @@ PUBLISHED = {
     "umf_superfeatures": 38_466_448,
     "umf_ransac": 39_385_229,
 }
-SENSES = {
-    "dbow2": "image",
-    "netvlad": "image",
-    "minkloc_visual": "image",
-    "lite0_gem": "image",
-    "anyloc_vlad": "image",
-    "thumbnail": "image",
-    "gradients": "image",
-    "pointnet2": "scan",
-    "minkloc_lidar": "scan",
-    "scan_context": "scan",
-    "solid": "scan",
-}
+_OF_IMAGES = ("dbow2", "netvlad", "minkloc_visual", "lite0_gem", "anyloc_vlad", "thumbnail", "gradients")
+_OF_SCANS = ("pointnet2", "minkloc_lidar", "scan_context", "solid")
+SENSES = dict.fromkeys(_OF_IMAGES, "image") | dict.fromkeys(_OF_SCANS, "scan")
 """The sensor of a method; others use both."""
 
 
@@ -211,8 +201,3 @@ def plot_methods(path: Path, results: Sequence[MethodResult]) -> None:
     axes.grid(axis="x", alpha=0.3)
     figure.savefig(path, dpi=120)
     plt.close(figure)
-
-
-def with_costs(results: Sequence[MethodResult], costs: Mapping[str, MethodCost]) -> list[MethodResult]:
-    """The results with what the methods cost."""
-    return [replace(found, cost=costs.get(found.name)) for found in results]

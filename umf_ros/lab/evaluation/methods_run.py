@@ -23,7 +23,6 @@ from umf_ros.lab.evaluation.methods import (
     methods_table,
     plot_methods,
     sets_table,
-    with_costs,
 )
 from umf_ros.lab.evaluation.results import EvaluationReport, TextTable, percent, plot_precision_recall, plot_recall
 from umf_ros.lab.evaluation.retrieval import (
@@ -184,8 +183,11 @@ class MethodsRun:
     def results(self, repeats: int) -> list[MethodResult]:
         """Results and costs, measured now, in the thesis's order."""
         self._report("taking times", 0)
-        found = [MethodResult(name, sets, None, self._xfeat.get(name, ())) for name, sets in self._answers.items()]
-        return sorted(with_costs(found, self._costs(repeats)), key=lambda one: one.of("recall1"))
+        costs = self._costs(repeats)
+        found = [
+            MethodResult(name, sets, costs.get(name), self._xfeat.get(name, ())) for name, sets in self._answers.items()
+        ]
+        return sorted(found, key=lambda one: one.of("recall1"))
 
     def _costs(self, repeats: int) -> dict[str, MethodCost]:
         costs = {}

@@ -280,11 +280,7 @@ class WorldsRun:
     """
 
     def __init__(
-        self,
-        weights: Path | None,
-        worlds: list[TestWorld],
-        repeats: int,
-        report: Callable[[str, int], None],
+        self, weights: Path | None, worlds: list[TestWorld], repeats: int, report: Callable[[str, int], None]
     ) -> None:
         self._weights = locate_weights(weights)
         self._worlds, self._repeats, self._report = worlds, repeats, report

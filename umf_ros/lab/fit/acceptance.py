@@ -148,15 +148,11 @@ def fit_decision(examples: list[Example], kind: str, threshold: float) -> tuple[
     return safe, odds + safe.bias - model.bias
 
 
-def fit_without(examples: list[Example], kind: str, domain: str) -> Logistic:
-    """The same of all domains but one."""
-    return fit_logistic([example for example in examples if example.domain != domain], kind)
-
-
 def left_out_odds(examples: list[Example], kind: str) -> Array:
     """Log-odds (N,) of the examples of a kind, each by a fit to the other domains."""
     mine = [example for example in examples if example.kind == kind]
-    models = {name: fit_without(mine, kind, name) for name in {example.domain for example in mine}}
+    domains = {example.domain for example in mine}
+    models = {name: fit_logistic([one for one in mine if one.domain != name], kind) for name in domains}
     return np.array([models[example.domain].odds(scores(example.measurements)) for example in mine])
 
 

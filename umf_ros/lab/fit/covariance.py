@@ -90,14 +90,9 @@ def covariances_of(samples: Sequence[PoseSample], model: CovarianceModel) -> Arr
     return np.asarray(covariance_of(information, model, overlap) + model.motion**2 * walked + grown + unknown)
 
 
-def squared_errors(samples: Sequence[PoseSample], model: CovarianceModel) -> Array:
-    """Normalised errors squared (N,) of samples."""
-    return normalised_errors(np.array([sample.error for sample in samples]), covariances_of(samples, model))
-
-
 def honesty(samples: Sequence[PoseSample], model: CovarianceModel) -> tuple[float, float]:
     """Median of the normalised errors squared, and their share inside the 95 % ellipsoid."""
-    squared = squared_errors(samples, model)
+    squared = normalised_errors(np.array([sample.error for sample in samples]), covariances_of(samples, model))
     return float(np.median(squared)), share_inside(squared)
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.core.frames import Candidate, Keyframe
-from umf_ros.core.geometry import Array, invert, make_pose, relative, rotation_angle, transform
+from umf_ros.core.geometry import Array, invert, make_pose, near, relative, rotation_angle, transform
 from umf_ros.embedding import Embedder, make_embedder
 from umf_ros.lab.fit.acceptance import (
     EXAMPLES,
@@ -30,14 +30,7 @@ from umf_ros.lab.fit.acceptance import (
     save_examples,
 )
 from umf_ros.lab.simulation.domains import DOMAINS, Domain
-from umf_ros.lab.simulation.domains.pairs import (
-    ELSEWHERE,
-    QUICK,
-    ScannedPlace,
-    ScanPair,
-    pairs_of,
-    places_of,
-)
+from umf_ros.lab.simulation.domains.pairs import ELSEWHERE, QUICK, ScannedPlace, ScanPair, pairs_of, places_of
 from umf_ros.lab.simulation.drives import SurveyedDrive, embedded, kept, kept_in, worlds
 from umf_ros.lab.simulation.scenes import TRAPS
 from umf_ros.lab.simulation.world import VALIDATION
@@ -86,14 +79,6 @@ def is_right(metres: float, degrees: float) -> bool | None:
     return False if metres > WRONG_M or degrees > WRONG_DEG else None
 
 
-def kept_examples(
-    domain: Domain, seeds: range, pairs: int, scans: Path | None, embedder: Embedder, kept: Path | None
-) -> list[Example]:
-    """The same as `examples_of`, from a file in the folder `kept` where an earlier call left it."""
-    path = kept / f"examples_{domain.name}_{seeds.start}_{len(seeds)}_{pairs}.pkl" if kept else None
-    return kept_in(path, lambda: list(examples_of(domain, seeds, pairs, scans, embedder)))
-
-
 def examples_of(domain: Domain, seeds: range, pairs: int, scans: Path | None, embedder: Embedder) -> Iterator[Example]:
     """Examples from pairs of surveys, of scans and then of submaps."""
     places = places_of(domain, seeds, QUICK, scans, embedder)
@@ -137,7 +122,7 @@ def _examples(tried: Tried, verifier: Verifier, domain: Domain, rng: np.random.G
         if (
             right is None
             or (right and measurements["common"] < MIN_COMMON)
-            or any(_same_basin(pose, other) for other in kept)
+            or any(near(pose, other, SAME_BASIN_M, SAME_BASIN_RAD) for other in kept)
         ):
             continue
         kept.append(pose)
@@ -194,11 +179,6 @@ def _seen(keyframe: Keyframe, view: str, all_round: bool) -> Keyframe:
     else:
         return keyframe
     return replace(keyframe, points=keyframe.points[chosen])
-
-
-def _same_basin(a: Array, b: Array) -> bool:
-    gap = relative(a, b)
-    return bool(np.linalg.norm(gap[:3, 3]) < SAME_BASIN_M and rotation_angle(gap) < SAME_BASIN_RAD)
 
 
 def _yaw(degrees: float) -> Array:
@@ -271,7 +251,9 @@ def in_domains(
 def _in_domain(
     domain: Domain, settings: EmbeddingSettings, pairs: int, folder: Path | None, kept: Path | None
 ) -> list[Example]:
-    return kept_examples(domain, SURVEYS, pairs, folder, make_embedder(settings), kept)
+    """Examples of one, from a file in the folder `kept` where an earlier call left it."""
+    path = kept / f"examples_{domain.name}_{SURVEYS.start}_{len(SURVEYS)}_{pairs}.pkl" if kept else None
+    return kept_in(path, lambda: list(examples_of(domain, SURVEYS, pairs, folder, make_embedder(settings))))
 
 
 def fit(examples: list[Example]) -> tuple[AcceptanceModel, dict[str, float]]:

@@ -30,12 +30,7 @@ from umf_ros.core.config import Loop, Verification
 from umf_ros.core.frames import Candidate, Keyframe
 from umf_ros.core.geometry import Array, heading, relative, wrap_angle
 from umf_ros.detector import LoopDetector, make_detector_embedder
-from umf_ros.lab.fit.acceptance import (
-    Example,
-    fit_covariance,
-    fit_logistic,
-    save_acceptance,
-)
+from umf_ros.lab.fit.acceptance import Example, fit_covariance, fit_logistic, save_acceptance
 from umf_ros.lab.simulation.drives import kept_in
 from umf_ros.places.database import Mask, is_past
 from umf_ros.runs.truth import (

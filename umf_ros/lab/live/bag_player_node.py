@@ -16,15 +16,15 @@ import rclpy
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rosgraph_msgs.msg import Clock
 
 from umf_ros.bags.reader import Bag, open_bag
+from umf_ros.commands.console import LineProgress, waiting
 from umf_ros.core.errors import BagError, UmfError
 from umf_ros.core.resources import find
+from umf_ros.nodes.conversions import latched
 from umf_ros.nodes.process import complain, init
 
 CLOCK_PERIOD_NS = 10_000_000
@@ -91,13 +91,13 @@ class BagPlayer(Node):
     def _make_publishers(self) -> dict[str, Publisher]:
         publishers: dict[str, Publisher] = {}
         for topic, info in self._bag.topics.items():
-            message_type = _message_type(info.type)
-            if message_type is None:
+            kind = message_type(info.type)
+            if kind is None:
                 self.get_logger().warning(f"{topic} is left out: {info.type} is not installed")
             elif topic != "/clock" and info.count:
                 # in a namespace its topics move along; the trees of transforms are one for all
                 name = topic if topic in ("/tf", "/tf_static") else topic.removeprefix("/")
-                publishers[topic] = self.create_publisher(message_type, name, _qos(topic))
+                publishers[topic] = self.create_publisher(kind, name, latched(20) if topic == "/tf_static" else 20)
         if not publishers:
             raise BagError(f"{self._bag.path} holds no topic whose message type is installed")
         return publishers
@@ -130,18 +130,13 @@ class BagPlayer(Node):
         self._clock_publisher.publish(message)
 
 
-def _message_type(name: str) -> Any | None:
+def message_type(name: str) -> Any | None:
+    """Return the class of a message by its name, as in sensor_msgs/msg/Image; None where it is not installed."""
     package, _, kind = name.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), kind, None)
     except ImportError:
         return None
-
-
-def _qos(topic: str) -> QoSProfile:
-    latched = topic == "/tf_static"
-    durability = QoSDurabilityPolicy.TRANSIENT_LOCAL if latched else QoSDurabilityPolicy.VOLATILE
-    return QoSProfile(depth=20, reliability=QoSReliabilityPolicy.RELIABLE, durability=durability)
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:
@@ -163,20 +158,13 @@ def _play(options: argparse.Namespace) -> None:
     console = Console(stderr=True)
     if bag.warning:
         console.print(bag.warning, style="yellow", markup=False, highlight=False, soft_wrap=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.completed:.0f} s"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=options.quiet) as progress:
-        if options.wait_for_subscribers:
-            waiting = progress.add_task("Waiting for subscribers", total=None)
+    progress = LineProgress(Console(stderr=True, quiet=options.quiet), f"Playing {bag.path.name}")
+    if options.wait_for_subscribers:
+        with waiting(progress.console, "Waiting for subscribers"):
             player.wait_for_subscribers()
-            progress.remove_task(waiting)
-        task = progress.add_task(f"Playing {bag.path.name}", total=bag.duration_s)
+    with progress:
         while True:
-            player.play(lambda seconds: progress.update(task, completed=seconds))
+            player.play(lambda seconds: progress.advance_to(seconds / max(bag.duration_s, 1e-9)))
             if not options.loop:
                 break
     player.finish()

@@ -13,8 +13,8 @@ from pathlib import Path
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from umf_ros.commands.console import LineProgress
 from umf_ros.core.config import load_settings
 from umf_ros.core.errors import UmfError
 from umf_ros.durable_graph import DurableGraph
@@ -170,13 +170,11 @@ class LiveGraph:
         return ["--ros-args", *(["--params-file", str(self._config.resolve())] if self._config else []), *words]
 
     def _watch(self, player: NodeProcess, seconds: float) -> None:
-        columns = (TextColumn("[progress.description]{task.description}"), BarColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=self._console, transient=True) as progress:
-            task = progress.add_task("Playing to the live nodes", total=seconds)
+        with LineProgress(self._console, "Playing to the live nodes") as progress:
             start = time.monotonic()
             while player.exit_code is None:
                 time.sleep(0.1)
-                progress.update(task, completed=min(time.monotonic() - start, seconds))
+                progress.advance_to(min((time.monotonic() - start) / seconds, 1.0))
                 for node in self._nodes:
                     if node.exit_code is not None:
                         raise UmfError(f"{node.name} died with status {node.exit_code}; see {self._folder / 'logs'}")

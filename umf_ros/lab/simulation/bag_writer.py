@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import struct
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -21,22 +19,15 @@ from umf_ros.bags.reader import message_types
 from umf_ros.core.errors import OutputError, writing
 from umf_ros.core.frames import StereoCamera
 from umf_ros.core.geometry import Array, to_quaternion
+from umf_ros.core.io import atomic_write
 
-CLOUD_TYPE = np.dtype(
-    [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("intensity", "<u4"),
-        ("ambient_light", "<u4"),
-        ("point_id", "<u4"),
-        ("point_time_offset", "<u4"),
-    ]
-)
+_COUNTS = ("intensity", "ambient_light", "point_id", "point_time_offset")
+CLOUD_TYPE = np.dtype([*((axis, "<f4") for axis in "xyz"), *((name, "<u4") for name in _COUNTS)])
 """The 28 bytes of a Blickfeld point; the time is in ns after the stamp of the message."""
 
 _TYPES = message_types().types
-_FLOAT32, _UINT32 = 7, 6
+_DATATYPES = {"f": 7, "u": 6}
+"""Of float32 and uint32 in a PointField."""
 
 
 def _new(kind: str, **values: Any) -> Any:
@@ -99,13 +90,7 @@ def camera_info_message(camera: StereoCamera, stamp_ns: int, frame: str, right: 
 def packed_cloud(records: NDArray[Any], stamp_ns: int, is_dense: bool) -> Any:
     """sensor_msgs/PointCloud2 in the frame `lidar` of records, whose fields are of four bytes."""
     fields = [
-        _new(
-            "sensor_msgs/msg/PointField",
-            name=name,
-            offset=offset,
-            datatype=_FLOAT32 if kind.kind == "f" else _UINT32,
-            count=1,
-        )
+        _new("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=_DATATYPES[kind.kind], count=1)
         for name, (kind, offset, *_) in (records.dtype.fields or {}).items()
     ]
     return _new(
@@ -205,10 +190,26 @@ class Recorder(Protocol):
         """Keep facts about the recording, where there is room for them."""
 
 
-class Ros1Writer:
+class _FileWriter:
+    """A file in the making: it gets its name when the context ends well; when it ends in an error nothing is left."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._opened = path, ExitStack()
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        self._unfinished = self._opened.enter_context(atomic_write(path))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._opened.__exit__(*error)
+
+
+class Ros1Writer(_FileWriter):
     """Writes a ROS 1 bag with LZ4 chunks, as S3LI's are; the drive's clock is shifted to the day of the recording.
 
-    `header.seq` counts the messages of each topic. When the context ends in an error, no file is left.
+    `header.seq` counts the messages of each topic.
     """
 
     def __init__(self, path: Path, shift_ns: int = 0, watch: Callable[[str, Any], None] = lambda *_: None) -> None:
@@ -217,12 +218,15 @@ class Ros1Writer:
         Raises:
             OutputError: the folder cannot be written.
         """
-        self.path, self._shift_ns, self._watch = path, shift_ns, watch
-        self._unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+        super().__init__(path)
+        self._shift_ns, self._watch = shift_ns, watch
         self._noetic = get_typestore(Stores.ROS1_NOETIC)
         self._connections: dict[str, tuple[Any, Iterator[int]]] = {}
         self._writer = Writer1(self._unfinished)
         self._writer.set_compression(Writer1.CompressionFormat.LZ4)
+        with writing(path):
+            self._writer.open()
+        self._opened.callback(self._writer.close)
 
     def write(self, topic: str, message: Any, stamp_ns: int) -> None:
         """Append a message with a header; raises an `OutputError` when the disk is full."""
@@ -241,30 +245,9 @@ class Ros1Writer:
     def note(self, name: str, facts: dict[str, str]) -> None:
         """Do nothing: these bags hold no facts."""
 
-    def __enter__(self) -> Ros1Writer:
-        with writing(self.path):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer.open()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            with writing(self.path):
-                self._writer.close()
-                if kind is None:
-                    self._unfinished.replace(self.path)
-        finally:
-            self._unfinished.unlink(missing_ok=True)
-
-
-class BagWriter:
-    """Writes an mcap file that ROS 2 tools and players open.
-
-    Messages are those of rosbags' ROS 2 Jazzy store. The file grows under a temporary name beside its
-    own and is renamed when the context ends well; when it ends in an error nothing is left.
-    """
+class BagWriter(_FileWriter):
+    """Writes an mcap file that ROS 2 tools and players open; its messages are those of rosbags' ROS 2 Jazzy store."""
 
     def __init__(self, path: str | Path) -> None:
         """Open `path` for writing; an older file there is replaced at the end.
@@ -272,22 +255,19 @@ class BagWriter:
         Raises:
             OutputError: the folder cannot be written.
         """
-        self.path = Path(path)
-        self._unfinished = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
-        self._store = message_types()
+        path = Path(path)
+        if path.is_dir():
+            raise OutputError(f"cannot write {path}: it is a folder")
+        super().__init__(path)
         self._channels: dict[str, tuple[int, str]] = {}
         self._counts: dict[str, int] = {}
-        if self.path.is_dir():
-            raise OutputError(f"cannot write {self.path}: it is a folder")
-        with writing(self.path):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream: IO[bytes] = self._unfinished.open("wb")
-        self._writer = Writer(self._stream, compression=CompressionType.LZ4)
-        try:
-            self._guarded(self._writer.start, "ros2", "umf_ros")
-        except OutputError:
-            self._discard()
-            raise
+        with self._opened:
+            stream = self._unfinished.open("wb")
+            self._opened.callback(stream.close)
+            self._writer = Writer(stream, compression=CompressionType.LZ4)
+            self._writer.start("ros2", "umf_ros")
+            self._opened.callback(self._writer.finish)
+            self._opened = self._opened.pop_all()
 
     def write(self, topic: str, message: Any, stamp_ns: int) -> None:
         """Append a message.
@@ -304,40 +284,17 @@ class BagWriter:
         if kind != message.__msgtype__:
             raise OutputError(f"{topic} holds {kind}, not {message.__msgtype__}")
         sequence = self._counts[topic] = self._counts.get(topic, -1) + 1
-        data = bytes(self._store.serialize_cdr(message, kind))
-        self._guarded(self._writer.add_message, channel, stamp_ns, data, stamp_ns, sequence)
+        data = bytes(message_types().serialize_cdr(message, kind))
+        with writing(self.path):
+            self._writer.add_message(channel, stamp_ns, data, stamp_ns, sequence)
 
     def note(self, name: str, facts: dict[str, str]) -> None:
         """Keep facts about the recording in the file, as an mcap metadata record."""
-        self._guarded(self._writer.add_metadata, name, facts)
-
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            if kind is None:
-                self._guarded(self._writer.finish)
-                self._guarded(self._stream.close)
-                self._guarded(self._unfinished.replace, self.path)
-        finally:
-            self._discard()
+        with writing(self.path):
+            self._writer.add_metadata(name, facts)
 
     def _add_channel(self, topic: str, kind: str) -> tuple[int, str]:
-        definition, _ = self._store.generate_msgdef(kind)
+        definition, _ = message_types().generate_msgdef(kind)
         schema = self._writer.register_schema(kind, "ros2msg", definition.encode())
-        channel = self._writer.register_channel(topic, "cdr", schema)
-        self._channels[topic] = (channel, kind)
-        return channel, kind
-
-    def _guarded(self, action: Any, *arguments: Any) -> None:
-        with writing(self.path):
-            action(*arguments)
-
-    def _discard(self) -> None:
-        """Remove what is unfinished; does nothing after a good end."""
-        with contextlib.suppress(OSError):  # the disk is full: what could not be flushed is thrown away anyway
-            self._stream.close()
-        self._unfinished.unlink(missing_ok=True)
+        self._channels[topic] = self._writer.register_channel(topic, "cdr", schema), kind
+        return self._channels[topic]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -157,10 +158,7 @@ def with_bias(world: GraphWorld, twist: Array) -> GraphWorld:
     """The world with every metre of its odometry wrong by the same (6,) twist, which its covariances do not state."""
     steps = invert(world.odometry[:-1]) @ world.odometry[1:]
     lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
-    odometry = [world.odometry[0]]
-    for step in steps @ expmap(lengths[:, None] * twist):
-        odometry.append(odometry[-1] @ step)
-    return replace(world, odometry=np.array(odometry))
+    return replace(world, odometry=_chained(world.odometry[0], steps @ expmap(lengths[:, None] * twist)))
 
 
 def with_lone_end(world: GraphWorld) -> GraphWorld:
@@ -248,17 +246,19 @@ def _upright(points: Array) -> Array:
     return poses
 
 
+def _chained(start: Array, steps: Array) -> Array:
+    """(N + 1, 4, 4) poses from the first one and N steps."""
+    return np.array([*accumulate(steps, np.matmul, initial=start)])
+
+
 def _drift(truth: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     steps = invert(truth[:-1]) @ truth[1:]
     lengths = np.maximum(np.linalg.norm(steps[:, :3, 3], axis=1), 0.05)
     sigmas = np.sqrt(lengths)[:, None] * _ODOMETRY_SIGMAS
     steps = steps @ expmap(rng.normal(size=sigmas.shape) * sigmas)
-    odometry = [truth[0]]
-    for step in steps:
-        odometry.append(odometry[-1] @ step)
     covariances = np.zeros((len(truth), 6, 6))
     covariances[1:] = sigmas[:, :, None] ** 2 * np.eye(6)
-    return np.array(odometry), covariances
+    return _chained(truth[0], steps), covariances
 
 
 def _true_closures(world: GraphWorld, rng: np.random.Generator, spacing: int, reach_m: float) -> list[WorldClosure]:
@@ -383,10 +383,7 @@ def _drift_by(truth: Array, rng: np.random.Generator, share: float) -> GraphWorl
     noise = lengths[:, None] * bias + np.sqrt(lengths)[:, None] * rng.normal(size=(len(steps), 6)) * _ODOMETRY_SIGMAS
 
     def drifted(factor: float) -> Array:
-        poses = [np.eye(4)]  # a map begins where the rover is
-        for step in steps @ expmap(factor * noise):
-            poses.append(poses[-1] @ step)
-        return orthonormal(np.array(poses))
+        return orthonormal(_chained(np.eye(4), steps @ expmap(factor * noise)))  # a map begins where the rover is
 
     begun = invert(truth[0])
 

@@ -22,6 +22,14 @@ CELLS = round(SIZE_M / CELL_M)
 _SHORE_M = 10.0
 
 
+class LevelGround:
+    """A place whose floor or road is level."""
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Height of the ground under points, m."""
+        return np.zeros(np.broadcast(x, y).shape)
+
+
 def spectral_noise(
     cells: int, slope: float, rng: np.random.Generator, lowest: float = 1.0, highest: float = np.inf
 ) -> Field:

@@ -91,19 +91,6 @@ def without_scan(keyframe: Keyframe) -> Keyframe:
     return replace(keyframe, embedding=replace(keyframe.embedding, cloud=None), points=np.empty((0, 3), np.float32))
 
 
-def yard_scan(seed: int, world_T_body: Array, boxes: int = 25) -> Array:
-    """A thinned scan, all around, of boxes and trunks on flat ground, each yard with its own."""
-    rng = np.random.default_rng(seed)
-    places, heights, sides = rng.uniform(-14, 14, (boxes, 2)), rng.uniform(0.6, 3, boxes), rng.uniform(0.2, 1.2, boxes)
-    noise = np.random.default_rng([seed, round(abs(world_T_body[0, 3]) * 100)])
-    parts = [np.column_stack([noise.uniform(-16, 16, (9000, 2)), np.zeros(9000)])]
-    for place, height, side in zip(places, heights, sides, strict=True):
-        angle, level = noise.uniform(0, 2 * np.pi, 300), noise.uniform(0, height, 300)
-        parts.append(np.column_stack([place + side * np.column_stack([np.cos(angle), np.sin(angle)]), level]))
-    points = np.vstack(parts) + noise.normal(0, 0.01, (9000 + 300 * boxes, 3))
-    return thin_scan(transform(invert(world_T_body), points).astype(np.float32))
-
-
 def _scan(ground: BumpyGround, world_T_body: Array, rng: np.random.Generator) -> Array:
     """Returns on a fan of bearings and depressions: the ground where a level ray at that angle would meet it."""
     bearing = np.radians(rng.uniform(-35, 35, 9000))

@@ -129,11 +129,7 @@ def shard_plan(seed: int) -> tuple[str, str]:
 
 
 def write_shard(
-    path: Path,
-    survey: Survey,
-    setting: str,
-    workers: int = 2,
-    progress: Callable[[int], None] = lambda done: None,
+    path: Path, survey: Survey, setting: str, workers: int = 2, progress: Callable[[int], None] = lambda done: None
 ) -> None:
     """Render a survey into a file, which appears under its name only when it is complete.
 

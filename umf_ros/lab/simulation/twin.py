@@ -194,11 +194,7 @@ def write_twin(
 
 
 def _write_sequence(
-    one: TwinSequence,
-    simulator: Simulator,
-    files: SideFiles,
-    workers: int,
-    progress: Callable[[str, float], None],
+    one: TwinSequence, simulator: Simulator, files: SideFiles, workers: int, progress: Callable[[str, float], None]
 ) -> None:
     shift_ns = int(one.start.timestamp()) * 10**9 - START_NS
     samples = Samples(simulator, one.name, files)

@@ -125,13 +125,7 @@ def correspondence(
 
 
 def _cross_entropy(
-    queries: Tensor,
-    keys: Tensor,
-    rows: Tensor,
-    targets: Tensor,
-    mask: Tensor,
-    spare: Tensor | None,
-    temperature: float,
+    queries: Tensor, keys: Tensor, rows: Tensor, targets: Tensor, mask: Tensor, spare: Tensor | None, temperature: float
 ) -> Tensor:
     """(L, K) negative log-likelihood of each target among all keys."""
     wanted = queries.gather(1, rows.unsqueeze(-1).expand(-1, -1, queries.shape[-1]))
@@ -394,10 +388,7 @@ class MetricLoss(nn.Module):
         }
         if self._settings.weight_super:
             different = negative[rows][:, rows]
-            supers = [
-                network.super_image(image.tokens, image.mask),
-                network.super_cloud(cloud.tokens, cloud.mask),
-            ]
+            supers = [network.super_image(image.tokens, image.mask), network.super_cloud(cloud.tokens, cloud.mask)]
             parts = [super_contrastive(found, *pairs, different) + decorrelation(found) for found in supers]
             losses["super"] = parts[0] + parts[1]
         return losses

@@ -126,10 +126,7 @@ class MetricObjective(Objective):
     settings_type = MetricSettings
 
     def __init__(
-        self,
-        network: UMF,
-        settings: MetricSettings,
-        validation: Callable[[], Sequence[SampleSequence]] | None = None,
+        self, network: UMF, settings: MetricSettings, validation: Callable[[], Sequence[SampleSequence]] | None = None
     ) -> None:
         super().__init__(network, settings)
         self._settings = settings

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from umf_ros.core.errors import ConfigError, WeightsError, writing
+from umf_ros.core.errors import ConfigError, WeightsError, one_line, writing
 from umf_ros.core.io import atomic_write
 from umf_ros.lab.datasets.sample import SampleSequence
 from umf_ros.lab.training.networks import Precision, RunSettings, make_network, save_weights
@@ -84,15 +84,11 @@ def resuming(path: Path) -> Iterator[dict[str, Any]]:
     try:
         state = dict(torch.load(path, map_location="cpu", weights_only=True))
     except Exception as error:  # torch.load raises whatever the damaged bytes provoke
-        raise WeightsError(f"cannot resume from {path}: {_one_line(error)}") from None
+        raise WeightsError(f"cannot resume from {path}: {one_line(error)}") from None
     try:
         yield state
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise WeightsError(f"cannot resume from {path}, which is of another run: {_one_line(error)}") from None
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
+        raise WeightsError(f"cannot resume from {path}, which is of another run: {one_line(error)}") from None
 
 
 OBJECTIVES = {

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
 from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.domains.solids import Scene, Solids, closed, distance_to, rounded_rectangle, wobbly_ring
+from umf_ros.lab.simulation.relief import LevelGround
 
 MODULE_M = 3.2
 DOOR_M = 1.3
 
 
-class Corridor:
+class Corridor(LevelGround):
     """Four corridors around a core: doors at equal distances, here and there a niche, a pillar, a cupboard."""
 
     lateral_m = 0.35
@@ -28,10 +28,6 @@ class Corridor:
         self._clear, self._height = rng.uniform(1.8, 2.8), rng.uniform(2.4, 3.0)
         self._recess = rng.uniform(0.12, 0.3)
         self.trail = rounded_rectangle(self._length, self._width, self._clear / 2)
-
-    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """The floor is level."""
-        return np.zeros(np.broadcast(x, y).shape)
 
     def scene(self, visit: int) -> Scene:
         """Walls stay, every second cupboard moves a little or goes."""
@@ -76,7 +72,7 @@ class Corridor:
                 solids.box([*place, 0.0], size, float(np.arctan2(along[1], along[0])), rng.uniform(0.2, 0.6))
 
 
-class Rooms:
+class Rooms(LevelGround):
     """Two rows of furnished rooms with doors between them; chairs move."""
 
     lateral_m = 0.2
@@ -91,10 +87,6 @@ class Rooms:
         self._height = rng.uniform(2.4, 3.2)
         self._doors = rng.uniform(0.3, 0.7, (2, self.columns + 1))
         self.trail = closed(self._route())
-
-    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """The floor is level."""
-        return np.zeros(np.broadcast(x, y).shape)
 
     def scene(self, visit: int) -> Scene:
         """Walls, tables and shelves stay, chairs do not."""
@@ -220,7 +212,7 @@ def _smooth(values: Array, times: int) -> Array:
     return smoothed
 
 
-class Tunnel:
+class Tunnel(LevelGround):
     """A vaulted tunnel that closes to a ring; without features nothing varies along it."""
 
     lateral_m = 0.35
@@ -231,10 +223,6 @@ class Tunnel:
         self._half_length = 0.25 * float(rng.integers(300, 400))
         self._radius = self._half_length / np.pi
         self.trail = wobbly_ring(self._radius, 0.0, rng)
-
-    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """The floor is level."""
-        return np.zeros(np.broadcast(x, y).shape)
 
     def scene(self, visit: int) -> Scene:
         """Walls and cabinets stay, a box moves."""
@@ -251,7 +239,7 @@ class Tunnel:
 SWAPPED = 0.1  # of the goods and pots, between visits
 
 
-class Rows:
+class Rows(LevelGround):
     """A hall of parallel rows: racks of goods in a warehouse, benches of plants in a greenhouse.
 
     Rows resemble each other: their goods differ a little in size, and a few slots are full in one row and empty in
@@ -275,10 +263,6 @@ class Rows:
         shape = (len(self._y), slots, levels)
         self._sizes = np.clip(rng.random((*shape[1:], 3)) + rng.normal(0, 0.1, (*shape, 3)), 0, 1)
         self._full = (rng.random(shape[1:]) < 0.85) ^ (rng.random(shape) < 0.05)
-
-    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """The floor is level."""
-        return np.zeros(np.broadcast(x, y).shape)
 
     def scene(self, visit: int) -> Scene:
         """Hall, racks and benches stay, some goods and pots change places."""

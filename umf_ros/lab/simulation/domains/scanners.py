@@ -140,15 +140,7 @@ SCANNERS: dict[str, Scanner] = {
     "spin16": Scanner(
         partial(spinning, tuple(np.linspace(-15, 15, 16)), 1800), 0.1, 100.0, 0.03, 255.0, timed=True, all_round=True
     ),
-    "spin32": Scanner(
-        partial(spinning, _HDL32_DEG, 1085),
-        0.1,
-        100.0,
-        0.02,
-        255.0,
-        timed=True,
-        all_round=True,
-    ),
+    "spin32": Scanner(partial(spinning, _HDL32_DEG, 1085), 0.1, 100.0, 0.02, 255.0, timed=True, all_round=True),
     "spin32_20hz": Scanner(
         partial(spinning, tuple(np.arange(-16.0, 16.0)), 1000), 0.05, 80.0, 0.02, 255.0, timed=True, all_round=True
     ),

@@ -5,17 +5,17 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from umf_ros.core.geometry import Array
 from umf_ros.lab.simulation.domains.solids import Scene, Solids, rounded_rectangle
+from umf_ros.lab.simulation.relief import LevelGround
 
 HALF_ROAD_M, PAVEMENT_M = 4.0, 2.2
 OCCUPIED = 0.55
 """Share of the parking lots with a car."""
 
 
-class Street:
+class Street(LevelGround):
     """A rectangular circuit of roads between two rows of buildings; cars come and go."""
 
     lateral_m = 1.2
@@ -26,10 +26,6 @@ class Street:
         self._length, self._width = rng.uniform(60, 80), rng.uniform(40, 50)
         self.trail = rounded_rectangle(self._length, self._width, 5.0)
         self._designs = [Facade(rng) for _ in range(3)]
-
-    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """The road is level."""
-        return np.zeros(np.broadcast(x, y).shape)
 
     def scene(self, visit: int) -> Scene:
         """Buildings and poles stay, a third of the parking lots change."""
