@@ -4,8 +4,8 @@ Scans look much the same all along. The pattern of one sensor lies on floor, wal
 it stands. Points of two scans therefore coincide at the identity pose although the places differ, and an alignment of
 points that begins near it stays there. All positions along a passage are therefore compared by what does not follow
 the pattern: points of one half of a scan, every second band of elevations, are compared with the other half of the
-other scan alone, so that no ring meets itself. A point's distance is that to a plane. What stands before the walls is
-no plane: its points are compared with points.
+other scan alone, so that no ring meets itself. A point's distance is that to a plane. Ivy, plants, cars and goods
+before the walls are no planes: their points are compared with points.
 
 The evidence for a position is how much worse all points together fit elsewhere, at the rival where that is least. How
 much the sums differ from one rival to the next shows what chance does in such a place.
