@@ -5,7 +5,7 @@ python tools/seasons_set.py seasons/.git OUT
 
 OUT/left and OUT/right, one for each camera, hold queries, references and truth.csv; `umf evaluate` reads
 OUT/places.yaml. Choices are made on the left one; the right one is asked once. The images are for non-commercial use
-(CC BY-NC-SA 4.0): they belong in no commit, and nothing is trained on them.
+(for research, under the terms of their authors): they belong in no commit, and nothing is trained on them.
 
 The truth comes from the time of the drive: of 25 pairs of the left camera with 16 or more epipolar inliers (SIFT), 23
 lie on one line of times within .13 s, .05 s in the mean, and both cameras share it. Later queries have no such pairs
