@@ -79,8 +79,8 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: 
     stays = abs((pose[:3, 3] - fits.poses[first, :3, 3]) @ way) <= const.PASSAGE_BESIDE_M
     here, least = pose if stays else fits.poses[first], const.TURNED_EVIDENCE if turned else const.PASSAGE_EVIDENCE
     evidence, differs = (0.0, 0.0) if told is None else (float(told.min()), float(told.std()))
-    if max(match.view.width_deg, query.view.width_deg) < const.FAN_DEG:
-        evidence = min(evidence, comparison.over_tilted(here))
+    if max(match.view.width_deg, query.view.width_deg) < const.FAN_DEG and comparison.fits_tilted(here):
+        evidence = min(evidence, 0.0)
     return Position(here, evidence, max(least, const.PASSAGE_CONTRAST * differs), comparison)
 
 
@@ -122,15 +122,15 @@ class Comparison:
             _means(misfits, known),
         )
 
-    def over_tilted(self, pose: Array) -> float:
-        """Evidence for a pose (4, 4) over those tilted about the direction across, which one wall leaves open."""
+    def fits_tilted(self, pose: Array) -> bool:
+        """Whether a pose (4, 4) fits better tilted about the direction across, which one wall leaves open."""
         ours, theirs = self._standing
         placed = [transform(pose, half) for half in ours] + theirs
         middle = np.concatenate([*placed, pose[None, :3, 3]]).mean(axis=0)
         across = np.cross(self._scans[0].up[2], self.way)
         turns = Rotation.from_rotvec(const.TILTS_RAD[:, None] * across / np.linalg.norm(across)).as_matrix()
         tilted = [make_pose(turn, middle - turn @ middle) @ pose for turn in turns]
-        return float(self.fits(np.stack([pose, *tilted])).worse(0)[1:].sum(axis=1).min())
+        return bool(self.fits(np.stack([pose, *tilted])).worse(0).sum(axis=1).min() < 0.0)
 
     def _of_planes(self, poses: Array, halves: Halves) -> Misfits:
         """Misfits of points of both scans with surfaces of the other, 1 in space that it saw empty."""
