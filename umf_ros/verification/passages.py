@@ -172,7 +172,7 @@ class Position(NamedTuple):
 
     def lead_over(self, poses: Sequence[Array]) -> float:
         """Return the evidence, also against other poses (4, 4) of the scans, as a share of what a closure needs."""
-        against = self.comparison.fits(np.stack([self.pose, *poses])).evidence(0)[1:]
+        against = self.comparison.fits(np.stack([self.pose, *poses])).evidence(0)[1:] if poses else np.empty(0)
         return float(against.min(initial=self.evidence)) / self.needed
 
     def compared(self, pose: Array) -> bool:
@@ -226,9 +226,9 @@ def _best(fits: _Fits, way: Array, count: int) -> tuple[int, Array | None]:
         if not len(elsewhere):
             return first, None
         told = fits.evidence(first)[elsewhere]
-        better = [(evidence, rival) for evidence, rival in zip(told.tolist(), elsewhere.tolist(), strict=True)]
-        rival = min((one for one in better if one[0] < 0.0 and one[1] < count), default=(0.0, first))[1]
-        if rival in tried:
+        against = np.where(elsewhere < count, told, 0.0)
+        rival = int(elsewhere[against.argmin()])
+        if against.min() >= 0.0 or rival in tried:
             return first, told
         first = rival
 
