@@ -64,6 +64,7 @@ LEAST_CHANCE = 0.02
 
 # registration
 THIN_CELL_M = 0.25  # by hand: a scan keeps some 4,500 of its returns
+FINEST_CELL_M = 0.125  # by hand: of a scan that would keep fewer points than are compared
 MAX_RANGE_M = 40.0  # geometry: beyond, returns of a flat scan are metres apart
 NEIGHBOURS = 5  # by hand: they reach the next ring
 PLANE_NEIGHBOURS = 8  # measured: 12 leave next to no planes of sixteen rings

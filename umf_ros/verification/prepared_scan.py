@@ -40,7 +40,12 @@ def thin_frame(frame: Frame) -> tuple[Points, ScanMotion | None]:
 def _cell_means(points: Points, values: Points) -> Points:
     """Means (M, C) float32 of values (N, C) over the points (N, 3) nearer than 40 m in every occupied cube."""
     points, values = (np.ascontiguousarray(rows, np.float32) for rows in (points, values))
-    return kernels.cell_means(points, values, const.THIN_CELL_M, const.MAX_RANGE_M)
+    cell_m = const.THIN_CELL_M
+    means = kernels.cell_means(points, values, cell_m, const.MAX_RANGE_M)
+    while len(means) < const.SAMPLE and cell_m > const.FINEST_CELL_M:
+        cell_m /= 2.0
+        means = kernels.cell_means(points, values, cell_m, const.MAX_RANGE_M)
+    return means
 
 
 class OrientedPoints(NamedTuple):
