@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.geometry import Array, cubes, invert, transform
+from umf_ros.core.geometry import Array, cubes, evenly, invert, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import relief_misfit
 from umf_ros.verification.pose_search import alternatives
@@ -126,12 +126,12 @@ def _differences(submap: PreparedScan, other: PreparedScan, other_T_submap: Arra
 def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> dict[str, float]:
     """Return how much worse two scans fit at other poses, as logarithms of the ratio of their misfits.
 
-    The misfit is the mean of points; where next to nothing stands, the share of relief that is not explained.
+    The misfit is the mean of points that stand up from the ground, for rings of a scanner lie on bare ground alike
+    wherever it stands; where next to nothing stands, the share of relief that is not explained.
 
     - `rival_near`: half a metre on, along the direction in which the position is known least;
     - `rival_far`: at the best pose 1 to 6 m on, and at the other peaks of the search at the same heading;
-    - `lead`: the latter as a share of what a closure needs. Near the identity, where the pattern of one sensor lies on
-      itself wherever the scans were taken, that is more. Unknown where next to nothing stands.
+    - `lead`: the latter as a share of what a closure needs. Unknown where next to nothing stands.
 
     0 when another pose fits as well. In a passage, where points follow the sensor's pattern, `passages` decides.
 
@@ -145,9 +145,10 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     way = np.append(across, 0.0)
     beside, along = (shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
     poses = np.stack([pose, *beside, *along, *alternatives(match, query, pose)])
-    stands = structured(match, query)
+    misfits = _mean_point_misfit(match, query, poses) if structured(match, query) else np.array([np.nan])
+    stands = bool(np.isfinite(misfits[0]))
     if stands:
-        misfits = _mean_point_misfit(match, query, poses)
+        misfits = np.where(np.isfinite(misfits), misfits, const.RIVAL_MISFIT)
     else:
         level = [levelled(match, query, one) for one in poses]
         misfits = np.array([relief_misfit(match.terrain, query.terrain, one) for one in level])
@@ -155,18 +156,12 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     found = {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
     if not stands:
         return found
-    needed = const.PATTERN_LEAD if patterned(match, query) and near_identity(pose) else const.MIN_LEAD
-    return found | {"lead": found["rival_far"] / needed}
+    return found | {"lead": found["rival_far"] / const.MIN_LEAD}
 
 
 def patterned(match: PreparedScan, query: PreparedScan) -> bool:
     """Whether the pattern of a sensor may lie in both scans in the same way; points of two submaps can avoid it."""
     return min(match.merged, query.merged) == 1
-
-
-def near_identity(pose: Array) -> bool:
-    """Whether the pattern may lie on itself at a pose (4, 4)."""
-    return float(np.linalg.norm(pose[:3, 3])) < const.PATTERN_M
 
 
 def repetition(match: PreparedScan, query: PreparedScan, pose: Array) -> float:
@@ -183,8 +178,8 @@ def repetition(match: PreparedScan, query: PreparedScan, pose: Array) -> float:
     others = alternatives(query, query, np.eye(4))
     if not others:
         return np.nan
-    own = np.fmin.reduce(_mean_point_misfit(query, query, np.stack(others), standing=True))
-    fit = _mean_point_misfit(match, query, pose[None], standing=True)[0]
+    own = np.fmin.reduce(_mean_point_misfit(query, query, np.stack(others)))
+    fit = _mean_point_misfit(match, query, pose[None])[0]
     return float(np.log(np.maximum(own, const.MISFIT_FLOOR)) - np.log(np.maximum(fit, const.MISFIT_FLOOR)))
 
 
@@ -242,27 +237,22 @@ def off_walls(points: Array, walls: Array, least_m: float = const.WALL_M) -> Mas
     return np.asarray((np.abs(points @ walls[:, :3].T - walls[:, 3]) >= least_m).all(axis=1))
 
 
-def _mean_point_misfit(match: PreparedScan, query: PreparedScan, poses: Array, standing: bool = False) -> Array:
+def _mean_point_misfit(match: PreparedScan, query: PreparedScan, poses: Array) -> Array:
     """(K,) mean of both ways of `_point_misfit` at poses (K, 4, 4) `match_T_query`."""
-    ways = _point_misfit(match, query, poses, standing), _point_misfit(query, match, invert(poses), standing)
-    return np.asarray(np.mean(ways, axis=0))
+    return np.asarray(np.mean([_point_misfit(match, query, poses), _point_misfit(query, match, invert(poses))], axis=0))
 
 
-def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array, standing: bool = False) -> Array:
-    """(K,) mean misfit with a scan of the other's visible points at poses (K, 4, 4).
-
-    Of its scouts, and the worst misfit where few are visible; or of all that stand among its sample, and NaN.
-    """
-    every = np.arange(0, len(other.sample), const.SCOUT_EVERY)
-    rows = np.flatnonzero(_upright(other, other.sample_normals)) if standing else every
+def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array:
+    """(K,) mean misfit with a scan of some of the other's standing points that are visible; NaN where few are."""
+    stands = np.flatnonzero(_upright(other, other.sample_normals))
+    rows = stands[evenly(len(stands), const.SAMPLE // const.SCOUT_EVERY)]
     reach = counterpart_reach(other.spacing[rows], common_blur(scan, other))
     misfit: Array = scan.free_space.point_misfits(scan.tree, other.sample[rows], reach, poses, const.RIVAL_MISFIT)
     if not patterned(scan, other):
         away = _distances_of_others(scan, other, poses, rows)
         misfit = np.where(np.isfinite(misfit) & np.isfinite(away), np.minimum(away / reach, const.RIVAL_MISFIT), np.nan)
     seen = np.isfinite(misfit)
-    few = const.FEWEST_POINTS, np.nan if standing else const.RIVAL_MISFIT
-    return mean_misfits(np.where(seen, misfit, 0.0), seen, *few)
+    return mean_misfits(np.where(seen, misfit, 0.0), seen, const.FEWEST_POINTS, np.nan)
 
 
 def _distances_of_others(submap: PreparedScan, other: PreparedScan, poses: Array, rows: NDArray[np.intp]) -> Array:
