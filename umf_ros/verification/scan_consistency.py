@@ -131,7 +131,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
 
     - `rival_near`: half a metre on, along the direction in which the position is known least;
     - `rival_far`: at the best pose 1 to 6 m on, and at the other peaks of the search at the same heading;
-    - `lead`: the latter as a share of what a closure needs. Unknown where next to nothing stands.
+    - `lead`: the smaller of both as a share of what a closure needs. Unknown where next to nothing stands.
 
     0 when another pose fits as well. In a passage, where points follow the sensor's pattern, `passages` decides.
 
@@ -156,7 +156,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
     found = {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
     if not stands:
         return found
-    return found | {"lead": found["rival_far"] / const.MIN_LEAD}
+    return found | {"lead": min(found.values()) / const.MIN_LEAD}
 
 
 def patterned(match: PreparedScan, query: PreparedScan) -> bool:
