@@ -26,6 +26,7 @@ from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_bl
 from umf_ros.verification.scan_alignment import run_gicp
 from umf_ros.verification.scan_consistency import (
     largest_walls,
+    least_known,
     mean_misfits,
     off_walls,
     patterned,
@@ -79,9 +80,30 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: 
     stays = abs((pose[:3, 3] - fits.poses[first, :3, 3]) @ way) <= const.PASSAGE_BESIDE_M
     here, least = pose if stays else fits.poses[first], const.TURNED_EVIDENCE if turned else const.PASSAGE_EVIDENCE
     evidence, differs = (0.0, 0.0) if told is None else (float(told.min()), float(told.std()))
-    if max(match.view.width_deg, query.view.width_deg) < const.FAN_DEG and comparison.fits_tilted(here):
+    if _fans(match, query) and comparison.fits_tilted(here):
         evidence = min(evidence, 0.0)
     return Position(here, evidence, max(least, const.PASSAGE_CONTRAST * differs), comparison)
+
+
+def fits_tilted(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> bool:
+    """Whether two single scans of a sensor that sees no more than a fan fit better tilted about the direction across.
+
+    A front leaves open how far the sensor is tilted in its plane, and points follow the pattern there too.
+
+    Args:
+        match: the matched scan.
+        query: the query's scan.
+        pose: (4, 4) `match_T_query`.
+        information: (6, 6) of the alignment.
+    """
+    if not (patterned(match, query) and _fans(match, query)):
+        return False
+    way = least_known(information)
+    return Comparison(match, query, way, shifted(pose, way, const.PASSAGE_SHIFTS_M)).fits_tilted(pose)
+
+
+def _fans(match: PreparedScan, query: PreparedScan) -> bool:
+    return max(match.view.width_deg, query.view.width_deg) < const.FAN_DEG
 
 
 class Comparison:

@@ -123,6 +123,11 @@ def _differences(submap: PreparedScan, other: PreparedScan, other_T_submap: Arra
     return np.concatenate(found)
 
 
+def least_known(information: Array) -> Array:
+    """(3,) the horizontal direction in which an alignment of this information (6, 6) knows the position least."""
+    return np.append(np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1], 0.0)
+
+
 def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> dict[str, float]:
     """Return how much worse two scans fit at other poses, as logarithms of the ratio of their misfits.
 
@@ -141,8 +146,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
         pose: (4, 4) `match_T_query`.
         information: (6, 6) of the alignment.
     """
-    across = np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1]
-    way = np.append(across, 0.0)
+    way = least_known(information)
     beside, along = (shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
     poses = np.stack([pose, *beside, *along, *alternatives(match, query, pose)])
     misfits = _mean_point_misfit(match, query, poses) if structured(match, query) else np.array([np.nan])

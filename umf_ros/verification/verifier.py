@@ -16,7 +16,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
-from umf_ros.verification.passages import Position, locate_along
+from umf_ros.verification.passages import Position, fits_tilted, locate_along
 from umf_ros.verification.pose_search import (
     RotatedMaps,
     TemporalMemory,
@@ -213,7 +213,10 @@ class Verifier:
         query, match = hypothesis.keyframes
         found = locate_along(theirs, ours, hypothesis.pose, _is_turned(query, match, hypothesis.pose))
         if found is None:
-            hypothesis.measurements |= ambiguity(theirs, ours, hypothesis.pose, hypothesis.alignment.information)
+            aligned = theirs, ours, hypothesis.pose, hypothesis.alignment.information
+            hypothesis.measurements |= ambiguity(*aligned)
+            if hypothesis.measurements.get("lead", 0.0) >= 1.0 and fits_tilted(*aligned):
+                hypothesis.measurements["lead"] = 0.0
             return None
         if found.pose is not hypothesis.pose:
             hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
