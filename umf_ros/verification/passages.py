@@ -80,15 +80,15 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: 
     stays = abs((pose[:3, 3] - fits.poses[first, :3, 3]) @ way) <= const.PASSAGE_BESIDE_M
     here, least = pose if stays else fits.poses[first], const.TURNED_EVIDENCE if turned else const.PASSAGE_EVIDENCE
     evidence, differs = (0.0, 0.0) if told is None else (float(told.min()), float(told.std()))
-    if _fans(match, query) and comparison.fits_tilted(here):
-        evidence = min(evidence, 0.0)
+    evidence = min(evidence, comparison.evidence_of_tilt(here))
     return Position(here, evidence, max(least, const.PASSAGE_CONTRAST * differs), comparison)
 
 
-def fits_tilted(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> bool:
-    """Whether two single scans of a sensor that sees no more than a fan fit better tilted about the direction across.
+def lead_over_tilted(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> float:
+    """Return how much worse two single scans fit tilted, as a share of what a closure needs.
 
-    A front leaves open how far the sensor is tilted in its plane, and points follow the pattern there too.
+    Infinite for a sensor that sees more than a fan. Before a front, a fan leaves open how far it is tilted in the
+    front's plane, and points follow the sensor's pattern there as they do along a passage.
 
     Args:
         match: the matched scan.
@@ -97,9 +97,10 @@ def fits_tilted(match: PreparedScan, query: PreparedScan, pose: Array, informati
         information: (6, 6) of the alignment.
     """
     if not (patterned(match, query) and _fans(match, query)):
-        return False
+        return np.inf
     way = least_known(information)
-    return Comparison(match, query, way, shifted(pose, way, const.PASSAGE_SHIFTS_M)).fits_tilted(pose)
+    comparison = Comparison(match, query, way, shifted(pose, way, const.PASSAGE_SHIFTS_M))
+    return comparison.evidence_of_tilt(pose) / const.PASSAGE_EVIDENCE
 
 
 def _fans(match: PreparedScan, query: PreparedScan) -> bool:
@@ -144,15 +145,22 @@ class Comparison:
             _means(misfits, known),
         )
 
-    def fits_tilted(self, pose: Array) -> bool:
-        """Whether a pose (4, 4) fits better tilted about the direction across, which one wall leaves open."""
+    def evidence_of_tilt(self, pose: Array) -> float:
+        """Return the evidence for a pose (4, 4) against those that are tilted about the direction across.
+
+        By 5 to 8 deg, and by more where what is seen nearby would move by less than half a metre. One front leaves
+        that open to a sensor that sees a fan; infinite for others.
+        """
+        if not _fans(*self._scans):
+            return np.inf
         ours, theirs = self._standing
         placed = [transform(pose, half) for half in ours] + theirs
         middle = np.concatenate([*placed, pose[None, :3, 3]]).mean(axis=0)
         across = np.cross(self._scans[0].up[2], self.way)
-        turns = Rotation.from_rotvec(const.TILTS_RAD[:, None] * across / np.linalg.norm(across)).as_matrix()
+        tilts = const.RIVAL_NEAR_M / min(const.TILTED_REACH_M, *(scan.reach_m for scan in self._scans))
+        turns = Rotation.from_rotvec(tilts[:, None] * across / np.linalg.norm(across)).as_matrix()
         tilted = [make_pose(turn, middle - turn @ middle) @ pose for turn in turns]
-        return bool(self.fits(np.stack([pose, *tilted])).worse(0).sum(axis=1).min() < 0.0)
+        return float(self.fits(np.stack([pose, *tilted])).evidence(0)[1:].min())
 
     def _of_planes(self, poses: Array, halves: Halves) -> Misfits:
         """Misfits of points of both scans with surfaces of the other, 1 in space that it saw empty."""

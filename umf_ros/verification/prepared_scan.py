@@ -185,10 +185,14 @@ class PreparedScan:
         return FieldOfView(self.upright_points)
 
     @cached_property
+    def reach_m(self) -> float:
+        """Median range of its points, m."""
+        return float(np.median(np.linalg.norm(self.points, axis=1)))
+
+    @cached_property
     def cell_m(self) -> float:
         """Side of a cell of the map, m, as the place asks for it."""
-        reach_m = float(np.median(np.linalg.norm(self.points, axis=1)))
-        steps = np.round(np.log2(reach_m / const.REACH_CELLS) * 2) / 2
+        steps = np.round(np.log2(self.reach_m / const.REACH_CELLS) * 2) / 2
         return float(np.clip(2.0**steps, *const.MAP_CELL_M))
 
     def map(self, cell_m: float) -> GridMap:

@@ -16,7 +16,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
-from umf_ros.verification.passages import Position, fits_tilted, locate_along
+from umf_ros.verification.passages import Position, lead_over_tilted, locate_along
 from umf_ros.verification.pose_search import (
     RotatedMaps,
     TemporalMemory,
@@ -215,8 +215,8 @@ class Verifier:
         if found is None:
             aligned = theirs, ours, hypothesis.pose, hypothesis.alignment.information
             hypothesis.measurements |= ambiguity(*aligned)
-            if hypothesis.measurements.get("lead", 0.0) >= 1.0 and fits_tilted(*aligned):
-                hypothesis.measurements["lead"] = 0.0
+            if (lead := hypothesis.measurements.get("lead", 0.0)) >= 1.0:
+                hypothesis.measurements["lead"] = min(lead, lead_over_tilted(*aligned))
             return None
         if found.pose is not hypothesis.pose:
             hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
