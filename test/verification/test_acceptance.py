@@ -20,7 +20,7 @@ from umf_ros.verification.acceptance import (
     refuted,
     scores,
 )
-from umf_ros.verification.constants import MIN_REPETITION, MIN_RUNNER_UP, SUBMAP_UNEXPLAINED
+from umf_ros.verification.constants import MIN_REPETITION, MIN_LEAD, SUBMAP_UNEXPLAINED
 from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, kind_of
 from umf_ros.verification.measurement import MEASUREMENTS
 
@@ -207,8 +207,8 @@ def test_what_was_never_measured_is_not_what_a_closure_was_lost_by(shipped: Acce
     ("measurements", "reason"),
     [
         (GOOD, None),
-        (GOOD | {"runner_up": 1.01 * MIN_RUNNER_UP}, None),
-        (GOOD | {"runner_up": 0.99 * MIN_RUNNER_UP}, RejectReason.AMBIGUOUS),
+        (GOOD | {"runner_up": 1.01 * MIN_LEAD}, None),
+        (GOOD | {"runner_up": 0.99 * MIN_LEAD}, RejectReason.AMBIGUOUS),
         (GOOD | {"lead": 1.01}, None),
         (GOOD | {"lead": 0.99}, RejectReason.AMBIGUOUS),
         (without(GOOD, *RIVALS) | {"lead": 0.99}, RejectReason.PASSAGE),

@@ -132,7 +132,7 @@ def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
     unexplained = measurements.get("unexplained", math.nan)
     if measurements.get("merged", 1.0) > 1 and "narrow" not in measurements and unexplained > const.SUBMAP_UNEXPLAINED:
         return RejectReason.UNEXPLAINED, f"{unexplained:.0%}"
-    return (RejectReason.AMBIGUOUS, "") if measurements.get("runner_up", math.nan) < const.MIN_RUNNER_UP else None
+    return (RejectReason.AMBIGUOUS, "") if measurements.get("runner_up", math.nan) < const.MIN_LEAD else None
 
 
 @dataclass(frozen=True, slots=True)

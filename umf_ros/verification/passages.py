@@ -99,8 +99,8 @@ def lead_over_tilted(match: PreparedScan, query: PreparedScan, pose: Array, info
     if not (patterned(match, query) and _fans(match, query)):
         return np.inf
     way = least_known(information)
-    comparison = Comparison(match, query, way, shifted(pose, way, const.PASSAGE_SHIFTS_M))
-    return comparison.evidence_of_tilt(pose) / const.PASSAGE_EVIDENCE
+    along = shifted(pose, way, const.PASSAGE_SHIFTS_M)
+    return Comparison(match, query, way, along).evidence_of_tilt(pose) / const.PASSAGE_EVIDENCE
 
 
 def _fans(match: PreparedScan, query: PreparedScan) -> bool:
@@ -141,7 +141,6 @@ class Comparison:
             np.concatenate([misfits, const.STANDING_WEIGHT * np.where(seen, before, self._usual)], axis=1),
             np.concatenate([known, seen], axis=1),
             np.concatenate([known, np.ones_like(seen)], axis=1),
-            np.concatenate([misfits == 1.0, np.zeros_like(seen)], axis=1),
             _means(misfits, known),
         )
 
@@ -220,7 +219,6 @@ class _Fits(NamedTuple):
         misfits: (K, N), those of what stands before the walls by their weight.
         here: (K, N) whether the misfit is known.
         there: (K, N) whether it counts at a rival; what stands before the walls does everywhere.
-        passed: (K, N) whether the other scan saw empty space there.
         means: (K,) logarithms of the mean misfit with planes; 0 where far fewer points than elsewhere are known.
     """
 
@@ -228,7 +226,6 @@ class _Fits(NamedTuple):
     misfits: Array
     here: NDArray[np.bool_]
     there: NDArray[np.bool_]
-    passed: NDArray[np.bool_]
     means: Array
 
     def worse(self, number: int) -> Array:
@@ -237,8 +234,8 @@ class _Fits(NamedTuple):
 
     def evidence(self, number: int) -> Array:
         """(K,) the sum over the points, or over those alone that no ray passed by, if that is less: others may move."""
-        worse = self.worse(number)
-        stayed = np.where(self.passed | self.passed[number], 0.0, worse)
+        worse, passed = self.worse(number), self.misfits == 1.0  # of what stands before the walls none is that large
+        stayed = np.where(passed | passed[number], 0.0, worse)
         return np.asarray(np.minimum(worse.sum(axis=1), stayed.sum(axis=1)))
 
     def elsewhere(self, number: int, way: Array) -> NDArray[np.bool_]:

@@ -24,7 +24,10 @@ Indices = NDArray[np.intp]
 
 
 def thin_scan(points: Points | None) -> Points:
-    """One mean point per occupied cube of 0.25 m, nearer than 40 m: (M, 3) float32, body frame."""
+    """One mean point per occupied cube nearer than 40 m: (M, 3) float32, body frame.
+
+    Cubes of 0.25 m; half of that where a scan would keep fewer points than are compared.
+    """
     points = np.empty((0, 3), np.float32) if points is None else points
     return _cell_means(points, points)
 
@@ -40,11 +43,9 @@ def thin_frame(frame: Frame) -> tuple[Points, ScanMotion | None]:
 def _cell_means(points: Points, values: Points) -> Points:
     """Means (M, C) float32 of values (N, C) over the points (N, 3) nearer than 40 m in every occupied cube."""
     points, values = (np.ascontiguousarray(rows, np.float32) for rows in (points, values))
-    cell_m = const.THIN_CELL_M
-    means = kernels.cell_means(points, values, cell_m, const.MAX_RANGE_M)
-    while len(means) < const.SAMPLE and cell_m > const.FINEST_CELL_M:
-        cell_m /= 2.0
-        means = kernels.cell_means(points, values, cell_m, const.MAX_RANGE_M)
+    means = kernels.cell_means(points, values, const.THIN_CELL_M, const.MAX_RANGE_M)
+    if len(means) < const.SAMPLE:
+        means = kernels.cell_means(points, values, const.THIN_CELL_M / 2, const.MAX_RANGE_M)
     return means
 
 
