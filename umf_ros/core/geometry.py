@@ -51,7 +51,7 @@ def invert(a_T_b: Array) -> Array:
     inverse = np.zeros(a_T_b.shape)
     turned = np.swapaxes(a_T_b[..., :3, :3], -1, -2)
     inverse[..., :3, :3] = turned
-    inverse[..., :3, 3] = -(turned @ a_T_b[..., :3, 3, None])[..., 0]
+    inverse[..., :3, 3:] = -(turned @ a_T_b[..., :3, 3:])
     inverse[..., 3, 3] = 1.0
     return inverse
 
