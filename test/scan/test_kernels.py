@@ -183,9 +183,13 @@ def test_misfits_are_those_of_points_and_planes(scan: Array, merged: tuple[list[
     by_planes = space.plane_misfits(tree, centres, ways, radii, planar, points, tried, 0.04, 0.8)
     for pose, of_points, of_planes in zip(tried, by_points, by_planes, strict=True):
         moved = transform(pose, points)
-        index, squared, sights = space.observe(tree, moved)
+        (index, squared), sights = tree.nearest(moved), space.look_at(moved)
         np.testing.assert_array_equal(index, oracle.neighbours(scan, moved, 1)[0][:, 0])
-        np.testing.assert_array_equal(sights, space.look_at(moved))
+        within_m = float(np.sqrt(np.median(squared)))
+        is_near = squared < np.float32(within_m**2)
+        near, away = tree.nearest(moved, within_m)
+        np.testing.assert_array_equal(near, np.where(is_near, index, 0))
+        np.testing.assert_array_equal(away, np.where(is_near, squared, np.inf))
         np.testing.assert_allclose(of_points, oracle.point_misfits(sights, np.sqrt(squared), reach, 3.0), atol=1e-3)
         fitted = centres, ways, np.minimum(radii, 0.8), planar
         np.testing.assert_allclose(of_planes, oracle.plane_misfits(sights, moved, scan, fitted, 0.04), atol=1e-3)

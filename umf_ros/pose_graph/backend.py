@@ -120,10 +120,9 @@ class PoseGraph:
         return [verdict for verdict in received if id(verdict.closure) not in known] + decided
 
     def receive(self, closures: Sequence[LoopClosure]) -> list[ClosureVerdict]:
-        """Take closures for `decide`, at a constant cost each; return the first verdict of every new one.
-
-        Repeated ones are counted only.
-        """
+        """Take closures for `decide`, at a constant cost each; return the first verdict of every new one."""
+        if not closures:  # as of most frames
+            return []
         self._refresh()
         stamps = np.array([closure.pair for closure in closures], np.int64).reshape(-1, 2)
         both = zip(closures, *self._sessions.find_pairs(stamps), strict=True)

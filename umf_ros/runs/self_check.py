@@ -245,7 +245,8 @@ def _overlap(theirs: NDArray[np.floating], ours: NDArray[np.floating], match_T_q
     moved = (transform(match_T_query, ours) + _SHIFTS_M[:, None]).astype(np.float32)
     inside = np.isin(_columns(moved.reshape(-1, 3)), np.unique(_columns(theirs))).reshape(moved.shape[:2])
     near = np.zeros(inside.shape, bool)
-    near[inside] = KdTree(np.ascontiguousarray(theirs)).nearest(np.ascontiguousarray(moved[inside]))[1] < _NEAR_M**2
+    tree = KdTree(np.ascontiguousarray(theirs))
+    near[inside] = tree.nearest(np.ascontiguousarray(moved[inside]), _NEAR_M)[1] < _NEAR_M**2
     counts = inside.sum(axis=1)
     shares = np.where(counts < _FEWEST, 0.0, near.sum(axis=1) / np.maximum(counts, 1))
     return float(shares[0]), float(shares[1:].max())

@@ -16,8 +16,11 @@ class KdTree:
 
     def __init__(self, points: Array) -> None: ...
     def __len__(self) -> int: ...
-    def nearest(self, queries: Array) -> tuple[NDArray[np.int64], Array]:
-        """Return the index (M,) of the point nearest to each of (M, 3), and its squared distance, m^2."""
+    def nearest(self, queries: Array, within_m: float = np.inf) -> tuple[NDArray[np.int64], Array]:
+        """Return the index (M,) of the point nearest to each of (M, 3), and its squared distance, m^2.
+
+        Where none is nearer than `within_m`, they are 0 and infinity; a short distance saves most of the search.
+        """
 
     def neighbours(self, queries: Array, count: int) -> tuple[NDArray[np.int64], Array]:
         """Return indices (M, K) of the K nearest points, the nearest first, and squared distances.
@@ -58,9 +61,6 @@ class FreeSpace:
     def __init__(self, images: Sequence[RangeImage], lidars_T_body: Array) -> None: ...
     def look_at(self, points: Array) -> NDArray[np.int8]:
         """Return 0 for each of points (N, 3) that lies where rays end, 1 where rays passed it by, 2 where hidden."""
-
-    def observe(self, tree: KdTree, points: Array) -> tuple[NDArray[np.int64], Array, NDArray[np.int8]]:
-        """Return `KdTree.nearest` and `look_at` of points (N, 3)."""
 
     def point_misfits(self, tree: KdTree, points: Array, reach_m: Array, poses: Array, most: float) -> Floats:
         """Return distances (K, N) to the nearest of a tree in units of `reach_m` (N,), at most `most`.

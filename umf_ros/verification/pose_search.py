@@ -297,11 +297,12 @@ class TemporalMemory:
 
 def _carried(found: _Finding, query: Keyframe, match: Keyframe) -> Array | None:
     """`match_T_query` as odometry carries it over from an earlier finding; None where that is far or unknown."""
-    steps = []
+    steps, way_m = [], 0.0
     for before, now in ((found.query, query), (found.match, match)):
         if before.odom_T_body is None or now.odom_T_body is None or before.session != now.session:
             return None
-        steps.append(relative(before.odom_T_body, now.odom_T_body))
-    if sum(float(np.linalg.norm(step[:3, 3])) for step in steps) > const.ODOMETRY_REACH_M:
+        steps.append((before.odom_T_body, now.odom_T_body))
+        way_m += math.dist(before.odom_T_body[:3, 3], now.odom_T_body[:3, 3])
+    if way_m > const.ODOMETRY_REACH_M:
         return None
-    return relative(steps[1], found.match_T_query @ steps[0])
+    return relative(relative(*steps[1]), found.match_T_query @ relative(*steps[0]))

@@ -170,7 +170,7 @@ class PreparedScan:
         """Rotation (3, 3) that sets the scan upright."""
         return upright(self.sample_normals)[0]
 
-    @property
+    @cached_property
     def upright_T_body(self) -> Array:
         """The same as a pose (4, 4)."""
         return make_pose(self.up, np.zeros(3))

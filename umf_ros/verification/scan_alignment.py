@@ -118,7 +118,7 @@ def run_gicp(
 def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:
     """Residuals, their Jacobian and the overlap of two scans at a pose."""
     moved = transform(pose, query.sample)
-    index, squared = match.tree.nearest(moved)
+    index, squared = match.tree.nearest(moved, const.COARSE_REACH_M)
     normals = match.normals[index]
     offset = moved - match.points[index]
     residual = np.einsum("ij,ij->i", offset, normals)

@@ -33,9 +33,9 @@ def compare_scans(match: PreparedScan, query: PreparedScan, pose: Array) -> dict
     """
     blur_m = common_blur(match, query)
     moved, back = transform(pose, query.sample), transform(invert(pose), match.sample)
-    index, squared, of_query = match.free_space.observe(match.tree, moved)
-    _, squared_back, of_match = query.free_space.observe(query.tree, back)
-    sights, distances = (of_query, of_match), (np.sqrt(squared), np.sqrt(squared_back))
+    (index, squared), (_, squared_back) = match.tree.nearest(moved), query.tree.nearest(back)
+    sights = match.free_space.look_at(moved), query.free_space.look_at(back)
+    distances = np.sqrt(squared), np.sqrt(squared_back)
     reaches = counterpart_reach(query.spacing, blur_m), counterpart_reach(match.spacing, blur_m)
     stands = _upright(match, match.normals[index]), _upright(match, match.sample_normals)
     ways = []
@@ -116,7 +116,8 @@ def _differences(submap: PreparedScan, other: PreparedScan, other_T_submap: Arra
         if np.isfinite(gaps[row].min()):
             one, its = ((it.scans or (it,))[i] for it, i in ((submap, row), (other, gaps[row].argmin())))
             points, spacing = one.sample[stands := _upright(one, one.sample_normals)], one.spacing[stands]
-            _, squared, sight = its.free_space.observe(its.tree, transform(other_T_submap, points))
+            moved = transform(other_T_submap, points)
+            sight, squared = its.free_space.look_at(moved), its.tree.nearest(moved)[1]
             missing = squared >= counterpart_reach(spacing, common_blur(one, its)) ** 2
             places = transform(map_T_submap, points) * [1.0, 1.0, 0.0]
             found.append(np.column_stack([places, sight == Sight.PASSED, missing])[sight != Sight.HIDDEN])

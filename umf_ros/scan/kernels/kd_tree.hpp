@@ -126,7 +126,7 @@ class KdTree {
   void search(const Vec3& query, const float& bound, Visit visit) const {
     if (nodes_.empty()) return;
     const float q[3] = {float(query[0]), float(query[1]), float(query[2])};
-    std::pair<int32_t, float> waiting[kDeepest];
+    struct { int32_t node; float squared; } waiting[kDeepest];  // a pair would be set to zero in every search
     int count = 0;
     for (int32_t at = 0;;) {
       while (nodes_[at].axis >= 0) {
@@ -146,8 +146,8 @@ class KdTree {
       do {
         if (count == 0) return;
         --count;
-      } while (!(waiting[count].second < bound));
-      at = waiting[count].first;
+      } while (!(waiting[count].squared < bound));
+      at = waiting[count].node;
     }
   }
 

@@ -39,7 +39,7 @@ void require(bool met, const char* text) {
   if (!met) throw std::invalid_argument(text);
 }
 
-nb::tuple nearest(const KdTree& tree, const Points& queries) {
+nb::tuple nearest(const KdTree& tree, const Points& queries, double within_m) {
   const size_t count = queries.shape(0);
   require(tree.size() > 0, "the tree has no points");
   Out<int64_t> index(count);
@@ -47,9 +47,10 @@ nb::tuple nearest(const KdTree& tree, const Points& queries) {
   {
     nb::gil_scoped_release free;
     for (size_t i = 0; i < count; ++i) {
-      float least = std::numeric_limits<float>::max();
-      index.data[i] = tree.nearest(row(queries.data(), i), least, 0);
-      squared.data[i] = least;
+      float least = static_cast<float>(std::min(within_m * within_m, 3e38));
+      const int32_t found = tree.nearest(row(queries.data(), i), least);
+      index.data[i] = std::max(found, 0);
+      squared.data[i] = found < 0 ? std::numeric_limits<double>::infinity() : least;
     }
   }
   return nb::make_tuple(index.of({count}), squared.of({count}));
@@ -132,25 +133,6 @@ nb::object look(const FreeSpace& space, const Points& points) {
   return nb::cast(sight.of({count}));
 }
 
-nb::tuple observe(const FreeSpace& space, const KdTree& tree, const Points& points) {
-  const size_t count = points.shape(0);
-  require(tree.size() > 0, "the tree has no points");
-  Out<int64_t> index(count);
-  Out<double> squared(count);
-  Out<int8_t> sight(count);
-  {
-    nb::gil_scoped_release free;
-    for (size_t i = 0; i < count; ++i) {
-      const Vec3 point = row(points.data(), i);
-      float least = std::numeric_limits<float>::max();
-      index.data[i] = tree.nearest(point, least, 0);
-      squared.data[i] = least;
-      sight.data[i] = space.look_at(point);
-    }
-  }
-  return nb::make_tuple(index.of({count}), squared.of({count}), sight.of({count}));
-}
-
 // Call `misfit(point, row)` of all points at all poses, without Python's lock; (K, N).
 template <typename Misfit>
 nb::object at_poses(const Points& points, const Poses& poses, Misfit misfit) {
@@ -221,7 +203,7 @@ NB_MODULE(_kernels, module) {
   nb::class_<KdTree>(module, "KdTree")
       .def("__init__", [](KdTree* self, const Points& points) { new (self) KdTree(points.data(), points.shape(0)); })
       .def("__len__", &KdTree::size)
-      .def("nearest", &nearest, "queries"_a)
+      .def("nearest", &nearest, "queries"_a, "within_m"_a = std::numeric_limits<double>::infinity())
       .def("neighbours", &neighbours, "queries"_a, "count"_a)
       .def("normals", &normals, "places"_a, "neighbours"_a, "width"_a = 0.0)
       .def("planes", &planes, "neighbours"_a);
@@ -241,7 +223,6 @@ NB_MODULE(_kernels, module) {
            },
            nb::keep_alive<1, 2>(), "images"_a, "lidars_T_body"_a)
       .def("look_at", &look, "points"_a)
-      .def("observe", &observe, "tree"_a, "points"_a)
       .def("point_misfits", &point_misfits, "tree"_a, "points"_a, "reach_m"_a, "poses"_a, "most"_a)
       .def("plane_misfits", &plane_misfits, "tree"_a, "centres"_a, "normals"_a, "reach_m"_a, "planar"_a, "points"_a,
            "poses"_a, "sigma_m"_a, "furthest_m"_a);
