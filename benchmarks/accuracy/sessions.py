@@ -54,12 +54,23 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Frame
-from umf_ros.core.geometry import Array, align, heading, make_pose, relative, rotation_angle, wrap_angle
+from umf_ros.core.geometry import (
+    Array,
+    align,
+    cubes,
+    heading,
+    make_pose,
+    relative,
+    rotation_angle,
+    transform,
+    wrap_angle,
+)
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import LoopDetector, make_detector_embedder
+from umf_ros.lab.scan_files import read_points
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.families import FAMILIES
-from umf_ros.lab.simulation.presets import SESSION, SESSION_LOOP_M, gentle_loop
+from umf_ros.lab.simulation.presets import SESSION, SESSION_LOOP_M, Preset, gentle_loop
 from umf_ros.lab.simulation.relief import Relief
 from umf_ros.lab.simulation.route import Walker
 from umf_ros.lab.simulation.simulator import Simulator, record
@@ -80,6 +91,8 @@ from umf_ros.sensors.sessions import OdometrySessionSplitter
 WITHIN_KEYFRAMES = 20
 CLOUD_STARTS = 10
 """Cold starts of each visitor in an imported map."""
+STAY, FLAT = 59, np.array([1.0, 1.0, 0.0])
+"""Scans after a start whose ground the map has to have, too, and what projects points onto the plane."""
 WRONG_M, WRONG_DEG = 1.0, 5.0
 OVERLAP_M = 20.0
 Stream = list[Frame | OdometrySample | AbsoluteMeasurement]
@@ -99,19 +112,20 @@ FULL, QUICK = Size(5, None, 10), Size(3, 40.0, 4)
 
 
 def drive_back(relief: Relief, rng: np.random.Generator) -> Walker:
-    """A part of the way of all sessions, in the opposite direction."""
+    """The way of all sessions, in the opposite direction; the preset's length cuts it."""
     loop = gentle_loop(relief, SESSION_LOOP_M, np.random.default_rng(0))[::-1]
-    return Walker(np.roll(loop, int(rng.integers(len(loop))), axis=0), rng).forward(75, lateral_m=0.7)
+    return Walker(np.roll(loop, int(rng.integers(len(loop))), axis=0), rng).forward(150, lateral_m=0.7)
 
 
 BACK = replace(SESSION, plan=drive_back)
+ROUND_BACK = replace(BACK, length_m=150)
 
 
-def simulated(work: Path, world: int, number: int, size: Size, back: bool = False) -> Path:
+def simulated(work: Path, world: int, number: int, size: Size, preset: Preset = SESSION) -> Path:
     """The recording of a session, simulated unless it is there."""
-    path = work / f"s{number}{'_back' if back else ''}.mcap"
+    path = work / f"s{number}{'' if preset is SESSION else '_back'}.mcap"
     if not path.exists():
-        family, preset = FAMILIES[world % len(FAMILIES)], BACK if back else SESSION
+        family = FAMILIES[world % len(FAMILIES)]
         simulator = Simulator(preset, world + number, size.duration_s, None, family, 1.0, world)
         if not size.images:
             simulator.exposures = []
@@ -222,7 +236,8 @@ def cold_starts(
 ) -> Starts:
     """The cold starts of a visitor.
 
-    All begin where a session of the map drove in the direction of the visitor, turned by an angle.
+    All begin where a session of the map drove in the direction of the visitor, turned by an angle, and where the map
+    has half of the ground that the visitor sees, then and 60 scans later: a narrow map may end behind its first place.
     """
     bag, truth = open_bag(visitor), truth_of(visitor)
     settings = settings_for(bag, None, "auto", mode="localization", map=str(folder.path))
@@ -232,8 +247,12 @@ def cold_starts(
     map_T_world = align(true[:, :3, 3], placed[:, :3, 3])[0]
     frames = [row for row, item in enumerate(stream) if isinstance(item, Frame)]
     poses, known = truth.at(np.array([stream[row].stamp_ns for row in frames], np.int64))
-    usable = np.array(frames)[known & sees_again(poses, true, turn_rad)]
-    rows = usable[np.linspace(0, max(len(usable) - 60, 0), count).astype(int)]
+    known &= sees_again(poses, true, turn_rad)
+    columns, mapped_ground = partial(cubes, cell_m=0.5), read_points(folder.path / "map.ply") * FLAT
+    seen = [transform(map_T_world @ pose, stream[row].points) * FLAT for row, pose in zip(frames, poses, strict=True)]
+    known &= [bool(np.isin(columns(points), columns(mapped_ground)).mean() > 0.5) for points in seen]
+    usable = np.array(frames)[:-STAY][known[:-STAY] & known[STAY:]]
+    rows = usable[np.linspace(0, len(usable) - 1, count).astype(int)]
     detector = LoopDetector(settings, make_detector_embedder(settings))
     return Starts(stream, rows.tolist(), detector, settings, map_T_world, truth)
 
@@ -328,12 +347,16 @@ def run_world(world: int, size: Size, work: Path, both_ways: bool, what: str = "
     """All figures of one world."""
     work.mkdir(parents=True, exist_ok=True)
     numbers = range(1, size.sessions + 1)
-    recordings = [simulated(work, world, number, size, both_ways and number % 2 == 0) for number in numbers]
-    visitor = simulated(work, world, size.sessions + 1, size, both_ways)
+    back = BACK if both_ways else SESSION
+    recordings = [simulated(work, world, number, size, (SESSION, back)[number % 2 == 0]) for number in numbers]
+    visitor = simulated(work, world, size.sessions + 1, size, back)
     truths = {recording.stem: truth_of(recording) for recording in recordings}
     folder, joint, summary = mapped(work / "map", recordings)
     if what == "cloud":
-        visitors = [simulated(work, world, size.sessions + 1, size, back) for back in (False, True)]
+        (work / "visitors").mkdir(exist_ok=True)
+        whole = replace(size, duration_s=None)  # a short one may meet the map in its first metres alone
+        ways = SESSION, ROUND_BACK
+        visitors = [simulated(work / "visitors", world, size.sessions + 1, whole, way) for way in ways]
         return {"world": world, **in_cloud(folder, joint, truths, visitors)}
     known = mapped(work / "map_one_way", recordings[::2])[:2] if both_ways else (folder, joint)
     visits = cold_starts(*known, truths, visitor, size.starts, np.pi * both_ways)
