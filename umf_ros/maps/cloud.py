@@ -7,6 +7,7 @@ along a trajectory, and joined to the first by exact closures: later recordings 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -27,6 +28,7 @@ from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import Drive, add_drive
 from umf_ros.sensors.calibration import NO_CAMERA
 from umf_ros.sensors.decode import OdometrySample
+from umf_ros.verification import constants as const
 
 SPACING_M, CELL_M = 1.0, 2.0
 """Distance of places along a trajectory, and sides of the cells without one."""
@@ -57,6 +59,12 @@ class VirtualLidar:
     range_m: float = 40.0
     height_m: float = 1.2
 
+    @property
+    def headings_deg(self) -> tuple[float, ...]:
+        """Headings, four at least, so close that a view in any direction is searched beside the nearest of them."""
+        count = max(4, math.ceil(180 / ((1 - const.SEARCHED_OVERLAP) * self.width_deg)))
+        return tuple(360.0 * number / count for number in range(count))
+
     def see(self, cloud: Array, map_T_lidar: Array) -> NDArray[np.float32]:
         """Return the points (M, 3) of a cloud (N, 3) in the map that it sees, in its own frame."""
         reach = np.abs(cloud[:, :2] - map_T_lidar[:2, 3]).max(axis=1) < self.range_m
@@ -66,20 +74,14 @@ class VirtualLidar:
         elevation = np.degrees(np.arcsin(points[:, 2] / np.maximum(away, _NEAREST_M)))
         seen = (away > _NEAREST_M) & (away < self.range_m) & (np.abs(azimuth) <= self.width_deg / 2)
         seen &= (elevation >= self.low_deg) & (elevation <= self.high_deg)
-        seen &= ~_hidden(azimuth, elevation, away, *_FINE)
+        seen &= ~_hidden(azimuth, elevation, away, *_FINE, away)
         near = away < _COARSE_M
         seen &= ~_hidden(azimuth, elevation, np.where(near, away, np.inf), *_COARSE, away)
         return np.asarray(points[seen], np.float32)
 
 
 def _hidden(
-    azimuth: Array,
-    elevation: Array,
-    away: Array,
-    cell_deg: float,
-    ratio: float,
-    margin_m: float,
-    own: Array | None = None,
+    azimuth: Array, elevation: Array, away: Array, cell_deg: float, ratio: float, margin_m: float, own: Array
 ) -> NDArray[np.bool_]:
     """Return (N,) which points lie behind a nearer one in their direction; `away` are those that hide, `own` all."""
     columns = round(360 / cell_deg)
@@ -88,7 +90,7 @@ def _hidden(
     image = np.full((int(180 / cell_deg) + 1, columns), np.inf)
     np.minimum.at(image, (row, column), away)
     nearest = minimum_filter1d(image, 3, axis=1, mode="wrap")[row, column]
-    return np.asarray((away if own is None else own) > ratio * nearest + margin_m)
+    return np.asarray(own > ratio * nearest + margin_m)
 
 
 def thinned(points: Array, path: Path) -> Array:
