@@ -207,7 +207,7 @@ def import_cloud(
     """Make a map of a point cloud of another program, to localise in with a LiDAR alone.
 
     Places are views of the LiDAR rendered out of the cloud, along the trajectory in both directions, or every two
-    metres in four or more.
+    metres in four.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -228,7 +228,7 @@ def import_cloud(
         read_points = import_module("umf_ros.lab.scan_files").read_points  # by name, as commands of the lab are
         points = clouds.thinned(read_points(cloud), cloud)
         poses = clouds.along(read_tum(trajectory)) if trajectory else clouds.standing(points, height)
-        headings = (0.0, 180.0) if trajectory else lidar.headings_deg
+        headings = (0.0, 180.0) if trajectory else (0.0, 90.0, 180.0, 270.0)
         views, embedder = clouds.CloudViews(points, poses, headings, lidar), make_detector_embedder(settings)
         target = MapFolder.open_or_create(out, settings)
         task = bar.add_task("Rendering places", total=len(poses) * len(headings))

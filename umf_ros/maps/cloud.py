@@ -7,7 +7,6 @@ along a trajectory, and joined to the first by exact closures: later recordings 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -28,7 +27,6 @@ from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import Drive, add_drive
 from umf_ros.sensors.calibration import NO_CAMERA
 from umf_ros.sensors.decode import OdometrySample
-from umf_ros.verification import constants as const
 
 SPACING_M, CELL_M = 1.0, 2.0
 """Distance of places along a trajectory, and sides of the cells without one."""
@@ -58,12 +56,6 @@ class VirtualLidar:
     high_deg: float = 30.0
     range_m: float = 40.0
     height_m: float = 1.2
-
-    @property
-    def headings_deg(self) -> tuple[float, ...]:
-        """Headings, four at least, so close that a view in any direction is searched beside the nearest of them."""
-        count = max(4, math.ceil(180 / ((1 - const.SEARCHED_OVERLAP) * self.width_deg)))
-        return tuple(360.0 * number / count for number in range(count))
 
     def see(self, cloud: Array, map_T_lidar: Array) -> NDArray[np.float32]:
         """Return the points (M, 3) of a cloud (N, 3) in the map that it sees, in its own frame."""
