@@ -149,12 +149,7 @@ def measure(seed: int, quick: bool) -> dict[str, Any]:
         gnss_alone = row("gnss_alone", (Aid.GNSS,), closures=False)
         first = world.graph.truth[0]
         far = f"{first[0, 3] + 60:.2f} {first[1, 3] + 40:.2f} {np.degrees(heading(first)) + 40:.2f}"
-        pair(
-            "model",
-            gravity,
-            (Aid.GRAVITY, Aid.ELEVATION),
-            elevation_model=drive.wrong_model(seed),
-        )
+        pair("model", gravity, (Aid.GRAVITY, Aid.ELEVATION), elevation_model=drive.wrong_model(seed))
         pair("start", gravity, (Aid.GRAVITY, Aid.ELEVATION), elevation_start=far)
         off = world.origin + np.array([0.002, 0.002, 0.0])
         gravity_gnss = row("gravity_gnss", (Aid.GRAVITY, Aid.GNSS))

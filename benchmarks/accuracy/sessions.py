@@ -5,14 +5,15 @@
     python benchmarks/accuracy/sessions.py --both-ways --seed 20001           # every second session the other way round
     python benchmarks/accuracy/sessions.py --what initial --quick --lidar-only --seed 20001
     python benchmarks/accuracy/sessions.py --what cloud --quick --lidar-only --seed 20001
-    python benchmarks/accuracy/sessions.py --grow --quick --seed 20001        # a map that grows where one localises
+    python benchmarks/accuracy/sessions.py --what grow --quick --seed 20001  # a map that grows where one localises
 
 Every session drives a part of one way of 100 m by a route, light and noise of its own; the world repeats itself
 (aliasing 1.0), and all clocks start at the same second. Recordings and maps stay in `--work` and are taken up again.
 A seed is a world; recordings are seeds + 1, + 2, and so on; the rover that wakes up drives the one after the last.
+Starts are spread over the drive of a visitor over the whole way, where the map has half of the ground that it sees.
 With `--both-ways`, every second session and the rover that wakes up drive in the opposite direction, and it wakes up in
 the map of the other sessions, all driven against its direction. The LiDAR is 70 degrees wide. `--lidar-only` leaves out
-the images, which take most of the time. With `--grow`, a map is made of the first session, the second and the third
+the images, which take most of the time. With `--what grow`, a map is made of the first session; the second and third
 localise in it with `localization.update`, and the fourth localises in the map of the first alone and in the grown one;
 prints and writes of both `keyframes`, those with a true closure (`closed`), and `wrong` closures.
 
@@ -38,7 +39,6 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -54,12 +54,13 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Frame
-from umf_ros.core.geometry import Array, align, heading, make_pose, relative, rotation_angle, wrap_angle
+from umf_ros.core.geometry import Array, align, evenly, heading, make_pose, relative, rotation_angle, transform
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import LoopDetector, make_detector_embedder
+from umf_ros.lab.scan_files import read_points
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.families import FAMILIES
-from umf_ros.lab.simulation.presets import SESSION, SESSION_LOOP_M, gentle_loop
+from umf_ros.lab.simulation.presets import SESSION, SESSION_LOOP_M, Preset, gentle_loop
 from umf_ros.lab.simulation.relief import Relief
 from umf_ros.lab.simulation.route import Walker
 from umf_ros.lab.simulation.simulator import Simulator, record
@@ -80,6 +81,8 @@ from umf_ros.sensors.sessions import OdometrySessionSplitter
 WITHIN_KEYFRAMES = 20
 CLOUD_STARTS = 10
 """Cold starts of each visitor in an imported map."""
+STAY = 59
+"""Scans after a start of which the map has to have the ground, too."""
 WRONG_M, WRONG_DEG = 1.0, 5.0
 OVERLAP_M = 20.0
 Stream = list[Frame | OdometrySample | AbsoluteMeasurement]
@@ -99,19 +102,20 @@ FULL, QUICK = Size(5, None, 10), Size(3, 40.0, 4)
 
 
 def drive_back(relief: Relief, rng: np.random.Generator) -> Walker:
-    """A part of the way of all sessions, in the opposite direction."""
+    """The way of all sessions, in the opposite direction; the preset's length cuts it."""
     loop = gentle_loop(relief, SESSION_LOOP_M, np.random.default_rng(0))[::-1]
-    return Walker(np.roll(loop, int(rng.integers(len(loop))), axis=0), rng).forward(75, lateral_m=0.7)
+    return Walker(np.roll(loop, int(rng.integers(len(loop))), axis=0), rng).forward(150, lateral_m=0.7)
 
 
 BACK = replace(SESSION, plan=drive_back)
+ROUND_BACK = replace(BACK, length_m=150)
 
 
-def simulated(work: Path, world: int, number: int, size: Size, back: bool = False) -> Path:
+def simulated(work: Path, world: int, number: int, size: Size, preset: Preset = SESSION) -> Path:
     """The recording of a session, simulated unless it is there."""
-    path = work / f"s{number}{'_back' if back else ''}.mcap"
+    path = work / f"s{number}{'' if preset is SESSION else '_back'}.mcap"
     if not path.exists():
-        family, preset = FAMILIES[world % len(FAMILIES)], BACK if back else SESSION
+        family = FAMILIES[world % len(FAMILIES)]
         simulator = Simulator(preset, world + number, size.duration_s, None, family, 1.0, world)
         if not size.images:
             simulator.exposures = []
@@ -198,8 +202,13 @@ def sees_again(poses: Array, known: Array, turn_rad: float = 0.0) -> Any:
     """(N,) which of N poses lie within a place of any known one, in about its direction turned by an angle."""
     rows = known[:: max(1, len(known) // 500)]
     near = np.linalg.norm(poses[:, None, :3, 3] - rows[None, :, :3, 3], axis=-1) <= PLACE_RADIUS_M
-    turned = np.abs(wrap_angle(heading(poses)[:, None] - heading(rows)[None] - turn_rad))
-    return (near & (turned <= np.radians(PLACE_ANGLE_DEG))).any(axis=1)
+    alike = np.cos(heading(poses)[:, None] - heading(rows)[None] - turn_rad) >= np.cos(np.radians(PLACE_ANGLE_DEG))
+    return (near & alike).any(axis=1)
+
+
+def cells(points: Array) -> Array:
+    """(N,) numbers of the cells of half a metre in the plane that points (N, 3) lie in."""
+    return np.asarray(np.floor(2.0 * points[:, :2]) @ [1e6, 1.0])
 
 
 class Starts(NamedTuple):
@@ -222,7 +231,8 @@ def cold_starts(
 ) -> Starts:
     """The cold starts of a visitor.
 
-    All begin where a session of the map drove in the direction of the visitor, turned by an angle.
+    All begin where a session of the map drove in the direction of the visitor, turned by an angle, and where the map
+    has half of the ground that the visitor sees, then and 59 scans later: behind its first place, it may have none.
     """
     bag, truth = open_bag(visitor), truth_of(visitor)
     settings = settings_for(bag, None, "auto", mode="localization", map=str(folder.path))
@@ -230,10 +240,14 @@ def cold_starts(
     true = np.concatenate([truths[one.session.name].at(one.stamps)[0] for one in joint.sessions])
     placed = np.concatenate([one.poses for one in joint.sessions])
     map_T_world = align(true[:, :3, 3], placed[:, :3, 3])[0]
-    frames = [row for row, item in enumerate(stream) if isinstance(item, Frame)]
+    frames = {row: np.asarray(item.points, float) for row, item in enumerate(stream) if isinstance(item, Frame)}
     poses, known = truth.at(np.array([stream[row].stamp_ns for row in frames], np.int64))
-    usable = np.array(frames)[known & sees_again(poses, true, turn_rad)]
-    rows = usable[np.linspace(0, max(len(usable) - 60, 0), count).astype(int)]
+    mapped_cells = cells(read_points(folder.path / "map.ply"))
+    seen = [cells(transform(map_T_world @ pose, points)) for pose, points in zip(poses, frames.values(), strict=True)]
+    known &= sees_again(poses, true, turn_rad)
+    known &= [bool(np.isin(one, mapped_cells).mean() > 0.5) for one in seen]
+    usable = np.array(list(frames))[:-STAY][known[:-STAY] & known[STAY:]]
+    rows = usable[evenly(len(usable), count)]
     detector = LoopDetector(settings, make_detector_embedder(settings))
     return Starts(stream, rows.tolist(), detector, settings, map_T_world, truth)
 
@@ -327,13 +341,18 @@ def in_cloud(folder: MapFolder, joint: JointMap, truths: dict[str, Trajectory], 
 def run_world(world: int, size: Size, work: Path, both_ways: bool, what: str = "") -> dict[str, Any]:
     """All figures of one world."""
     work.mkdir(parents=True, exist_ok=True)
+    if what == "grow":
+        return grown(world, size, work)
     numbers = range(1, size.sessions + 1)
-    recordings = [simulated(work, world, number, size, both_ways and number % 2 == 0) for number in numbers]
-    visitor = simulated(work, world, size.sessions + 1, size, both_ways)
+    every_second = BACK if both_ways else SESSION
+    recordings = [simulated(work, world, number, size, (every_second, SESSION)[number % 2]) for number in numbers]
     truths = {recording.stem: truth_of(recording) for recording in recordings}
     folder, joint, summary = mapped(work / "map", recordings)
+    (work / "visitors").mkdir(exist_ok=True)
+    whole = size.sessions + 1, replace(size, duration_s=None)  # short ones may meet the map for some metres only
+    visitor = simulated(work / "visitors", world, *whole, ROUND_BACK if both_ways else SESSION)
     if what == "cloud":
-        visitors = [simulated(work, world, size.sessions + 1, size, back) for back in (False, True)]
+        visitors = [visitor, simulated(work / "visitors", world, *whole, ROUND_BACK)]
         return {"world": world, **in_cloud(folder, joint, truths, visitors)}
     known = mapped(work / "map_one_way", recordings[::2])[:2] if both_ways else (folder, joint)
     visits = cold_starts(*known, truths, visitor, size.starts, np.pi * both_ways)
@@ -353,7 +372,6 @@ def run_world(world: int, size: Size, work: Path, both_ways: bool, what: str = "
 
 def grown(world: int, size: Size, work: Path) -> dict[str, Any]:
     """Keyframes, closed keyframes and wrong closures of a fourth session in a map of one session, and of three."""
-    work.mkdir(parents=True, exist_ok=True)
     first, *later, visitor = (simulated(work, world, number, size) for number in range(1, 5))
     truths = {recording.stem: truth_of(recording) for recording in (first, *later, visitor)}
     still, growing = mapped(work / "map_still", [first])[0].path, work / "map_growing"
@@ -415,35 +433,21 @@ def median(values: Any) -> float | None:
     return round(float(np.median(known)), 4) if known else None
 
 
-def seeds(first: int | None) -> Iterator[int]:
-    """One world, or five test worlds whose recordings' seeds do not meet."""
-    return iter([first] if first is not None else range(TEST.start + 1, TEST.start + 51, 10))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="three sessions of 40 s, four cold starts")
     parser.add_argument("--both-ways", action="store_true", help="sessions in both directions, cold starts against it")
-    parser.add_argument("--grow", action="store_true", help="a fourth session in a map that grew, or did not")
-    parser.add_argument("--what", choices=("", "initial", "cloud"), default="", help="cold starts with a difference")
+    parser.add_argument("--what", choices=("", "initial", "cloud", "grow"), default="", help="other figures")
     parser.add_argument("--lidar-only", action="store_true", help="without images")
     parser.add_argument("--seed", type=int, help="seed of a single world")
-    parser.add_argument(
-        "--work", type=Path, default=Path("results/sessions"), help="where recordings and maps are kept"
-    )
+    parser.add_argument("--work", type=Path, default=Path("results/sessions"), help="of recordings and maps")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     arguments = parser.parse_args()
     size = replace(QUICK if arguments.quick else FULL, images=not arguments.lidar_only)
     kind = ("quick" if arguments.quick else "full") + ("_both_ways" if arguments.both_ways else "")
     kind += "_lidar" if arguments.lidar_only else ""
-    if arguments.grow:
-        found = [grown(world, size, arguments.work / f"{kind}_{world}") for world in seeds(arguments.seed)]
-        print(json.dumps(found, indent=2))
-        if arguments.json is not None:
-            arguments.json.write_text(json.dumps(found, indent=2) + "\n")
-        return
     worlds = []
-    for world in seeds(arguments.seed):
+    for world in [arguments.seed] if arguments.seed is not None else range(TEST.start + 1, TEST.start + 51, 10):
         folder = arguments.work / f"{kind}_{world}"
         worlds.append(run_world(world, size, folder, arguments.both_ways, arguments.what))
         print(json.dumps(worlds[-1]), flush=True)

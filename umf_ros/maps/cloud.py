@@ -66,20 +66,14 @@ class VirtualLidar:
         elevation = np.degrees(np.arcsin(points[:, 2] / np.maximum(away, _NEAREST_M)))
         seen = (away > _NEAREST_M) & (away < self.range_m) & (np.abs(azimuth) <= self.width_deg / 2)
         seen &= (elevation >= self.low_deg) & (elevation <= self.high_deg)
-        seen &= ~_hidden(azimuth, elevation, away, *_FINE)
+        seen &= ~_hidden(azimuth, elevation, away, *_FINE, away)
         near = away < _COARSE_M
         seen &= ~_hidden(azimuth, elevation, np.where(near, away, np.inf), *_COARSE, away)
         return np.asarray(points[seen], np.float32)
 
 
 def _hidden(
-    azimuth: Array,
-    elevation: Array,
-    away: Array,
-    cell_deg: float,
-    ratio: float,
-    margin_m: float,
-    own: Array | None = None,
+    azimuth: Array, elevation: Array, away: Array, cell_deg: float, ratio: float, margin_m: float, own: Array
 ) -> NDArray[np.bool_]:
     """Return (N,) which points lie behind a nearer one in their direction; `away` are those that hide, `own` all."""
     columns = round(360 / cell_deg)
@@ -88,7 +82,7 @@ def _hidden(
     image = np.full((int(180 / cell_deg) + 1, columns), np.inf)
     np.minimum.at(image, (row, column), away)
     nearest = minimum_filter1d(image, 3, axis=1, mode="wrap")[row, column]
-    return np.asarray((away if own is None else own) > ratio * nearest + margin_m)
+    return np.asarray(own > ratio * nearest + margin_m)
 
 
 def thinned(points: Array, path: Path) -> Array:
