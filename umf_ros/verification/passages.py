@@ -79,9 +79,8 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: 
     # about this place the alignment knows better where it is than planes do
     stays = abs((pose[:3, 3] - fits.poses[first, :3, 3]) @ way) <= const.PASSAGE_BESIDE_M
     here, least = pose if stays else fits.poses[first], const.TURNED_EVIDENCE if turned else const.PASSAGE_EVIDENCE
-    evidence, differs = (0.0, 0.0) if told is None else (float(told.min()), float(told.std()))
-    evidence = min(evidence, comparison.evidence_of_tilt(here))
-    return Position(here, evidence, max(least, const.PASSAGE_CONTRAST * differs), comparison)
+    evidence = min(float(told.min()), comparison.evidence_of_tilt(here))
+    return Position(here, evidence, max(least, const.PASSAGE_CONTRAST * float(told.std())), comparison)
 
 
 def lead_over_tilted(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> float:
@@ -244,19 +243,16 @@ class _Fits(NamedTuple):
         return np.asarray(~beside & (self.means < 0.0))
 
 
-def _best(fits: _Fits, way: Array, count: int) -> tuple[int, Array | None]:
-    """Which of the first poses fits better than all others, and the evidence (R,) against these; None without any."""
+def _best(fits: _Fits, way: Array, count: int) -> tuple[int, Array]:
+    """Which of the first poses fits better than all others, and the evidence (R,) against these, 0 without any."""
     first, tried = 0, set[int]()
     while True:
         tried.add(first)
         elsewhere = np.flatnonzero(fits.elsewhere(first, way))
-        if not len(elsewhere):
-            return first, None
         told = fits.evidence(first)[elsewhere]
-        against = np.where(elsewhere < count, told, 0.0)
-        rival = int(elsewhere[against.argmin()])
-        if against.min() >= 0.0 or rival in tried:
-            return first, told
+        against = told[elsewhere < count]
+        if against.min(initial=0.0) >= 0.0 or (rival := int(elsewhere[against.argmin()])) in tried:
+            return first, told if len(told) else np.zeros(1)
         first = rival
 
 

@@ -91,8 +91,7 @@ class Surfaces:
         thickness, width, length = spread.T
         even = (thickness < const.PLANE_SIGMA_M) & (4 * thickness < width)
         wide = (width > const.PLANE_WIDTH_M) & (width > const.PLANE_ROUNDNESS * length)
-        planar = even & wide & (reach < const.PLANE_REACH_M)
-        return cls(points, tree, normals, centres, reach, planar)
+        return cls(points, tree, normals, centres, reach, even & wide & (reach < const.PLANE_REACH_M))
 
 
 class PreparedScan:

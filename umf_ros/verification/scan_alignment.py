@@ -96,8 +96,7 @@ class Alignment:
 def align_scans(match: PreparedScan, query: PreparedScan, guess: Array) -> Alignment:
     """Generalised ICP (Segal, RSS 2009) from the pose `guess`, first far-sighted, then near-sighted."""
     pose = run_gicp(match, query.oriented_sample, guess, const.COARSE_REACH_M, const.COARSE_END)
-    pose = run_gicp(match, query.oriented_sample, pose, const.FINE_REACH_M)
-    return inspect(match, query, pose)
+    return inspect(match, query, run_gicp(match, query.oriented_sample, pose, const.FINE_REACH_M))
 
 
 def run_gicp(
@@ -111,8 +110,7 @@ def run_gicp(
 
     Counterparts are nearer than `reach_m`; it ends with a step below `ends`, m and rad.
     """
-    guess = np.ascontiguousarray(guess)
-    return kernels.align(match.tree, match.normals, *query, guess, reach_m, const.STEPS, *ends)
+    return kernels.align(match.tree, match.normals, *query, np.ascontiguousarray(guess), reach_m, const.STEPS, *ends)
 
 
 def inspect(match: PreparedScan, query: PreparedScan, pose: Array) -> Alignment:

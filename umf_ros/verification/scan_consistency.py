@@ -159,9 +159,7 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
         misfits = np.array([relief_misfit(match.terrain, query.terrain, one) for one in level])
     fit, far = np.log(np.maximum(misfits, const.MISFIT_FLOOR)), 1 + len(beside)
     found = {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
-    if not stands:
-        return found
-    return found | {"lead": min(found.values()) / const.MIN_LEAD}
+    return found | ({"lead": min(found.values()) / const.MIN_LEAD} if stands else {})
 
 
 def patterned(match: PreparedScan, query: PreparedScan) -> bool:
@@ -201,18 +199,13 @@ def beyond_walls(match: PreparedScan, query: PreparedScan, pose: Array) -> float
     """
     if not structured(match, query):
         return np.nan
-    shares = _beyond_walls(query, match, pose), _beyond_walls(match, query, invert(pose))
+    shares = []
+    for scan, other, at in ((query, match, pose), (match, query, invert(pose))):
+        sight = other.free_space.look_at(transform(at, scan.sample))
+        seen = _upright(scan, scan.sample_normals) & (sight != Sight.HIDDEN)
+        off = off_walls(scan.sample, largest_walls(scan.sample[seen], scan.sample_normals[seen]))
+        shares.append(_share(off, seen, np.nan))
     return float(np.fmin.reduce(shares))
-
-
-def _beyond_walls(scan: PreparedScan, other: PreparedScan, other_T_scan: Array) -> float:
-    seen = _upright(scan, scan.sample_normals) & (
-        other.free_space.look_at(transform(other_T_scan, scan.sample)) != Sight.HIDDEN
-    )
-    points, normals = scan.sample[seen], scan.sample_normals[seen]
-    if len(points) < const.FEWEST_POINTS:
-        return np.nan
-    return float(off_walls(points, largest_walls(points, normals)).mean())
 
 
 def upright_sample(scan: PreparedScan) -> tuple[Array, Array]:

@@ -192,7 +192,9 @@ class Verifier:
             one.probability = self._probability(one)
             if one.scans and self._objection(one) is None:
                 one.measurements |= self._commonplace(one)
-        _compare_headings(passages)
+        for one, found in passages:  # those at another heading are rivals
+            rivals = [other for other, _ in passages if other is not one and other.candidate is one.candidate]
+            one.measurements["lead"] = found.lead_over([other.pose for other in rivals])
         return judged
 
     def _promises(self, hypothesis: Hypothesis, least: float) -> bool:
@@ -326,10 +328,3 @@ def _is_turned(query: Keyframe, match: Keyframe, pose: Array) -> bool:
     if query.session == match.session and query.odom_T_body is not None and match.odom_T_body is not None:
         pose = invert(relative(match.odom_T_body, query.odom_T_body)) @ pose
     return abs(float(heading(pose))) > np.pi / 2
-
-
-def _compare_headings(passages: list[tuple[Hypothesis, Position]]) -> None:
-    """Of hypotheses in a passage, count those at another heading of the same candidate as rivals."""
-    for one, found in passages:
-        others = [its.pose for other, its in passages if other is not one and other.candidate is one.candidate]
-        one.measurements["lead"] = found.lead_over(others)
