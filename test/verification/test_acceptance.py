@@ -20,7 +20,7 @@ from umf_ros.verification.acceptance import (
     refuted,
     scores,
 )
-from umf_ros.verification.constants import MIN_REPETITION, MIN_LEAD, SUBMAP_UNEXPLAINED
+from umf_ros.verification.constants import MIN_LEAD, MIN_REPETITION, SUBMAP_UNEXPLAINED
 from umf_ros.verification.hypothesis import IMAGE, SCAN, SUBMAP, kind_of
 from umf_ros.verification.measurement import MEASUREMENTS
 
