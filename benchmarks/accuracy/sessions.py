@@ -54,7 +54,7 @@ from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import Settings
 from umf_ros.core.frames import Frame
-from umf_ros.core.geometry import Array, align, evenly, heading, make_pose, relative, rotation_angle, transform
+from umf_ros.core.geometry import Array, align, cubes, evenly, heading, make_pose, relative, rotation_angle, transform
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.scan_files import read_points
@@ -206,9 +206,9 @@ def sees_again(poses: Array, known: Array, turn_rad: float = 0.0) -> Any:
     return (near & alike).any(axis=1)
 
 
-def cells(points: Array) -> Array:
+def cells(points: Array) -> Any:
     """(N,) numbers of the cells of half a metre in the plane that points (N, 3) lie in."""
-    return np.asarray(np.floor(2.0 * points[:, :2]) @ [1e6, 1.0])
+    return cubes(points * [1.0, 1.0, 0.0], 0.5)
 
 
 class Starts(NamedTuple):

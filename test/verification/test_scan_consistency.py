@@ -91,9 +91,9 @@ def test_only_what_stands_counts_as_upright() -> None:
 
 def test_a_corridor_fits_anywhere_along_it_and_a_hall_does_not() -> None:
     here = make_pose(np.eye(3), [1.0, 0.0, 0.0])
-    query, match = seen(corridor(), here, 15.0), seen(corridor(), np.eye(4), 15.0)
-    near, far, lead = ambiguity(match, query, here, inspect(match, query, here).information).values()
-    assert near < 0.1 and far < 0.1 and lead < 1.0
+    pairs = [(seen(corridor(), np.eye(4), 10.0), seen(corridor(), here, 10.0)) for _ in range(5)]
+    near, far, lead = np.array([[*ambiguity(*one, here, inspect(*one, here).information).values()] for one in pairs]).T
+    assert abs(near.mean()) < 0.1 and far.max() < 0.1 and lead.max() < 1.0
     near, far, lead = ambiguity(MATCH, QUERY, THERE, inspect(MATCH, QUERY, THERE).information).values()
     assert near > 0.15 and far > 0.3 and lead > 1.0
 

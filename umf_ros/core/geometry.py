@@ -195,11 +195,12 @@ def cubes(points: Array, cell_m: float) -> NDArray[np.int64]:
 
 def first_of_cubes(points: Array, cell_m: float) -> NDArray[np.intp]:
     """Return the index of the first of points (N, 3) in every occupied cube of this side, m, in order."""
-    numbers = cubes(points, cell_m)
-    order = np.argsort(numbers)  # not stable, which takes five times as long
-    ordered = numbers[order]
-    starts = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)])
-    return np.sort(np.minimum.reduceat(order, starts)) if len(order) else order
+    return np.sort(np.unique(cubes(points, cell_m), return_index=True)[1])
+
+
+def median_range(points: NDArray[np.floating]) -> float:
+    """Return the median distance of points (N, 3) from the origin, m."""
+    return float(np.median(np.linalg.norm(points, axis=1)))
 
 
 _RADIUS_M, _ECCENTRICITY2 = 6_378_137.0, 6.694379990141e-3

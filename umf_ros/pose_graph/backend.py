@@ -120,7 +120,7 @@ class PoseGraph:
         return [verdict for verdict in received if id(verdict.closure) not in known] + decided
 
     def receive(self, closures: Sequence[LoopClosure]) -> list[ClosureVerdict]:
-        """Take closures for `decide`, at a constant cost each; return the first verdict of every new one."""
+        """Take closures for `decide`, at a constant cost each; return the first verdicts; repeats are counted only."""
         if not closures:  # as of most frames
             return []
         self._refresh()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Frame, Points, ScanMotion
-from umf_ros.core.geometry import Array, expmap, invert, logmap, relative, rotation_angle, transform
+from umf_ros.core.geometry import Array, expmap, invert, logmap, median_range, relative, rotation_angle, transform
 from umf_ros.core.odometry_noise import LEAST_JUMP, STEPS_BEFORE, jump_excess
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.scan import _kernels
@@ -190,7 +190,7 @@ class ScanLimits:
             hint = f"intensities reach {self._strongest:.3g}"
             # drivers send 0 where there is no intensity: not counted
             keep = keep & self._limited(f"min_intensity {self._min_intensity:g}", strong, cloud.intensity > 0, hint)
-        range_m = float(np.median(np.linalg.norm(cloud.points, axis=1))) if len(cloud.points) else 0.0
+        range_m = median_range(cloud.points) if len(cloud.points) else 0.0
         if range_m > FARTHEST_M:
             where = f"half of a scan's returns are beyond {range_m:.0f} m"
             self._warn_once("units", f"{where}: points have to be in metres (REP 103); such scans give no closures")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Keyframe, ScanMotion
-from umf_ros.core.geometry import Array, cubes, first_of_cubes, heading, relative, transform
+from umf_ros.core.geometry import Array, cubes, first_of_cubes, heading, median_range, relative, transform
 from umf_ros.places.store import KeyframeStore
 from umf_ros.submaps.lookalikes import KeypointIndex
 from umf_ros.verification import constants as const
@@ -26,7 +26,7 @@ def submap_of(keyframe: Keyframe, others: Sequence[Keyframe], drift: DriftMeter)
         others: of the same session, the nearest along the path first.
         drift: of the odometry.
     """
-    reach_m = _reach_m(keyframe)
+    reach_m = median_range(keyframe.points)
     needed = [
         one for one in needed_scans(keyframe, others) if drift.blur(_way_m(keyframe, one), reach_m) < const.MAX_BLUR_M
     ]
@@ -38,7 +38,7 @@ def needed_scans(keyframe: Keyframe, others: Sequence[Keyframe]) -> Sequence[Key
 
     A sensor that is sparse at the distances of the structure, or sees little of what is around, needs many.
     """
-    reach_m = _reach_m(keyframe)
+    reach_m = median_range(keyframe.points)
     cell_m = float(np.clip(reach_m / const.REACH_CELLS, *const.MAP_CELL_M))
     seen, counts = np.empty(0, np.int64), []
     for one in (keyframe, *others):
@@ -90,11 +90,6 @@ def _body_T_other(keyframe: Keyframe, other: Keyframe) -> Array:
 
 def _way_m(keyframe: Keyframe, other: Keyframe) -> float:
     return abs(keyframe.path_length_m - other.path_length_m)
-
-
-def _reach_m(keyframe: Keyframe) -> float:
-    """Median distance of the points, m."""
-    return float(np.median(np.linalg.norm(keyframe.points, axis=1)))
 
 
 def submap_around(keyframe: Keyframe, others: Sequence[Keyframe]) -> Keyframe | None:

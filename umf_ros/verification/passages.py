@@ -25,6 +25,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur
 from umf_ros.verification.scan_alignment import run_gicp
 from umf_ros.verification.scan_consistency import (
+    ambiguity,
     largest_walls,
     least_known,
     mean_misfits,
@@ -83,11 +84,11 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: 
     return Position(here, evidence, max(least, const.PASSAGE_CONTRAST * float(told.std())), comparison)
 
 
-def lead_over_tilted(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> float:
-    """Return how much worse two single scans fit tilted, as a share of what a closure needs.
+def compare_elsewhere(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> dict[str, float]:
+    """Return `ambiguity`, whose `lead` has to hold against tilted poses as well.
 
-    Infinite for a sensor that sees more than a fan. Before a front, a fan leaves open how far it is tilted in the
-    front's plane, and points follow the sensor's pattern there as they do along a passage.
+    Before a front, a sensor that sees a fan leaves open how far it is tilted in the front's plane, and points of two
+    single scans follow its pattern there as they do along a passage.
 
     Args:
         match: the matched scan.
@@ -95,11 +96,12 @@ def lead_over_tilted(match: PreparedScan, query: PreparedScan, pose: Array, info
         pose: (4, 4) `match_T_query`.
         information: (6, 6) of the alignment.
     """
-    if not (patterned(match, query) and _fans(match, query)):
-        return np.inf
-    way = least_known(information)
-    along = shifted(pose, way, const.PASSAGE_SHIFTS_M)
-    return Comparison(match, query, way, along).evidence_of_tilt(pose) / const.PASSAGE_EVIDENCE
+    found = ambiguity(match, query, pose, information)
+    if found.get("lead", 0.0) >= 1.0 and patterned(match, query) and _fans(match, query):
+        way = least_known(information)
+        comparison = Comparison(match, query, way, shifted(pose, way, const.PASSAGE_SHIFTS_M))
+        found["lead"] = min(found["lead"], comparison.evidence_of_tilt(pose) / const.PASSAGE_EVIDENCE)
+    return found
 
 
 def _fans(match: PreparedScan, query: PreparedScan) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.frames import Frame, Keyframe, Points, ScanMotion
-from umf_ros.core.geometry import Array, evenly, invert, make_pose, transform
+from umf_ros.core.geometry import Array, evenly, invert, make_pose, median_range, transform
 from umf_ros.core.levelling import upright
 from umf_ros.scan import _kernels as kernels
 from umf_ros.verification import constants as const
@@ -187,7 +187,7 @@ class PreparedScan:
     @cached_property
     def reach_m(self) -> float:
         """Median range of its points, m."""
-        return float(np.median(np.linalg.norm(self.points, axis=1)))
+        return median_range(self.points)
 
     @cached_property
     def cell_m(self) -> float:

@@ -16,7 +16,7 @@ from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
 from umf_ros.verification.measurement import closure_covariance, measure, runner_up
-from umf_ros.verification.passages import Position, lead_over_tilted, locate_along
+from umf_ros.verification.passages import Position, compare_elsewhere, locate_along
 from umf_ros.verification.pose_search import (
     RotatedMaps,
     TemporalMemory,
@@ -27,7 +27,7 @@ from umf_ros.verification.pose_search import (
 from umf_ros.verification.prepared_scan import ScanCache
 from umf_ros.verification.rerank import Offered, rerank, select
 from umf_ros.verification.scan_alignment import align_scans, inspect
-from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, excess_differences, repetition
+from umf_ros.verification.scan_consistency import beyond_walls, excess_differences, repetition
 
 NO_GUESSES: Mapping[int, Array] = MappingProxyType({})
 
@@ -215,10 +215,9 @@ class Verifier:
         query, match = hypothesis.keyframes
         found = locate_along(theirs, ours, hypothesis.pose, _is_turned(query, match, hypothesis.pose))
         if found is None:
-            aligned = theirs, ours, hypothesis.pose, hypothesis.alignment.information
-            hypothesis.measurements |= ambiguity(*aligned)
-            if (lead := hypothesis.measurements.get("lead", 0.0)) >= 1.0:
-                hypothesis.measurements["lead"] = min(lead, lead_over_tilted(*aligned))
+            hypothesis.measurements |= compare_elsewhere(
+                theirs, ours, hypothesis.pose, hypothesis.alignment.information
+            )
             return None
         if found.pose is not hypothesis.pose:
             hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)

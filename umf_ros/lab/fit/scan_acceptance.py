@@ -39,10 +39,11 @@ from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import CRITERIA, AcceptanceModel, Logistic, Measurements, load_acceptance, refuted
 from umf_ros.verification.hypothesis import SCAN, SUBMAP, Hypothesis
 from umf_ros.verification.measurement import measure, runner_up
+from umf_ros.verification.passages import compare_elsewhere
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.rerank import rerank
 from umf_ros.verification.scan_alignment import align_scans
-from umf_ros.verification.scan_consistency import ambiguity, excess_differences
+from umf_ros.verification.scan_consistency import excess_differences
 
 RIGHT_M, RIGHT_DEG = 0.3, 2.5
 WRONG_M, WRONG_DEG = 0.75, 4.0  # what lies between is neither
@@ -151,7 +152,7 @@ def _aligned(
 ) -> tuple[Array, Measurements]:
     alignment = align_scans(*scans, guess)
     hypothesis = Hypothesis.of(tried.query, ranked, tried.match, pose=alignment.pose, scans=scans, alignment=alignment)
-    found = measure(hypothesis) | ambiguity(*scans, alignment.pose, alignment.information)
+    found = measure(hypothesis) | compare_elsewhere(*scans, alignment.pose, alignment.information)
     hypothesis.measurements |= found | excess_differences(*scans, alignment.pose)
     return alignment.pose, hypothesis.measurements | runner_up(hypothesis, others)
 
@@ -170,8 +171,7 @@ def _seen(keyframe: Keyframe, view: str, all_round: bool) -> Keyframe:
     points = transform(invert(keyframe.body_T_lidar), keyframe.points.astype(float))
     if view == "narrow":
         half_deg = 36.0 if all_round else 25.0
-        ahead = keyframe.points @ np.array([1.0, 0.0, 0.0]), keyframe.points @ np.array([0.0, 1.0, 0.0])
-        chosen = np.abs(np.degrees(np.arctan2(ahead[1], ahead[0]))) < half_deg
+        chosen = np.abs(np.degrees(np.arctan2(keyframe.points[:, 1], keyframe.points[:, 0]))) < half_deg
     elif view == "near":
         chosen = np.linalg.norm(points, axis=1) < 14.0
     elif view == "sparse":
