@@ -45,8 +45,6 @@ BELOW = {
     "residual_p90_m": 0.05,
     "overlap": 0.9,
     "points": 900.0,
-    "relief_m": 0.1,
-    "terrain_correlation": 0.5,
     "terrain_score": 5.0,
     "common": 0.7,
     "contradiction": 0.0,

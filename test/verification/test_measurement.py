@@ -43,7 +43,7 @@ def test_every_name_says_what_it_is() -> None:
     assert all(len(meaning.split()) >= 3 for meaning in MEASUREMENTS.values())
 
 
-NOT_HERE = {"upright_counterparts", "unexplained", "lead", "narrow", "repetition", "runner_up"}
+NOT_HERE = {"upright_counterparts", "unexplained", "lead", "narrow", "repetition"}
 """Where nothing stands, in no passage, without odometry, of a single hypothesis."""
 
 
@@ -72,7 +72,7 @@ def test_a_pair_of_scans_is_measured_completely() -> None:
     steady = measured(*still)
     assert steady["residual_m"] < steady["noise_m"] < found["residual_p90_m"]
     assert found["points"] > 500
-    assert found["terrain_correlation"] > 0.7 and found["terrain_score"] > 10
+    assert found["terrain_score"] > 10
     assert found["position_std_m"] < 0.1 and found["heading_std_deg"] < 0.5
     assert found["support"] == 0
 

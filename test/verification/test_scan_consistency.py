@@ -14,9 +14,9 @@ from umf_ros.verification import thin_scan
 from umf_ros.verification.acceptance import refuted
 from umf_ros.verification.hypothesis import RejectReason
 from umf_ros.verification.prepared_scan import PreparedScan
-from umf_ros.verification.scan_alignment import inspect
 from umf_ros.verification.scan_consistency import ambiguity, beyond_walls, compare_scans, excess_differences, repetition
 
+AHEAD, SIDEWAYS = np.eye(3)[:2]
 RNG = np.random.default_rng(5)
 UP = make_pose(np.eye(3), [0.0, 0.0, 1.5])  # the sensor on its mast
 THERE = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [2.0, 1.0, 0.0])
@@ -92,9 +92,9 @@ def test_only_what_stands_counts_as_upright() -> None:
 def test_a_corridor_fits_anywhere_along_it_and_a_hall_does_not() -> None:
     here = make_pose(np.eye(3), [1.0, 0.0, 0.0])
     pairs = [(seen(corridor(), np.eye(4), 10.0), seen(corridor(), here, 10.0)) for _ in range(5)]
-    near, far, lead = np.array([[*ambiguity(*one, here, inspect(*one, here).information).values()] for one in pairs]).T
+    near, far, lead = np.array([[*ambiguity(*one, here, AHEAD).values()] for one in pairs]).T
     assert abs(near.mean()) < 0.1 and far.max() < 0.1 and lead.max() < 1.0
-    near, far, lead = ambiguity(MATCH, QUERY, THERE, inspect(MATCH, QUERY, THERE).information).values()
+    near, far, lead = ambiguity(MATCH, QUERY, THERE, AHEAD).values()
     assert near > 0.15 and far > 0.3 and lead > 1.0
 
 
@@ -108,14 +108,16 @@ def test_rings_on_bare_ground_are_no_rivals() -> None:
         PreparedScan(thin_scan(np.concatenate([rings, transform(back, standing)]).astype(np.float32)), UP)
         for back in (invert(here), np.eye(4))
     )
-    assert ambiguity(match, query, here, 100.0 * np.eye(6))["lead"] > 3.0
-    assert ambiguity(match, query, np.eye(4), 100.0 * np.eye(6))["lead"] < 0.0
+    assert ambiguity(match, query, here, SIDEWAYS)["lead"] > 3.0
+    assert ambiguity(match, query, np.eye(4), SIDEWAYS)["lead"] < 0.0
 
 
 def test_a_pose_beside_the_right_one_has_a_better_rival() -> None:
     beside = make_pose(np.eye(3), [2.0, 0.0, 0.0]) @ THERE
-    information = np.diag([0.1, 100.0, 100.0, 100.0, 100.0, 100.0])  # x is known least
-    assert ambiguity(MATCH, QUERY, beside, information)["rival_far"] < -0.3
+    assert ambiguity(MATCH, QUERY, beside, AHEAD)["rival_far"] < -0.3
+    for away, leads in ((8.0, True), (0.01, False)):  # another hypothesis is a rival too
+        other = make_pose(np.eye(3), [0.0, away, 0.0]) @ THERE
+        assert (ambiguity(MATCH, QUERY, THERE, SIDEWAYS, [other])["lead"] > 1.0) == leads
 
 
 def test_pillars_that_come_again_to_any_side_are_rivals() -> None:
@@ -125,7 +127,7 @@ def test_pillars_that_come_again_to_any_side_are_rivals() -> None:
     found = []
     for pillars in (lattice, single):
         query, match = (seen(box((-30, 30), (-30, 30), 3.0, pillars), np.eye(4), 9.0) for _ in range(2))
-        found.append(ambiguity(match, query, np.eye(4), 100.0 * np.eye(6))["rival_far"])
+        found.append(ambiguity(match, query, np.eye(4), SIDEWAYS)["rival_far"])
     assert found[0] < 0.15 < found[1] - 0.1
 
 
@@ -133,7 +135,7 @@ def test_a_room_that_looks_the_same_turned_round_has_a_rival_at_the_same_place()
     found = []
     for pillars in ([[3.0, 1.5], [-3.0, -1.5]], [[3.0, 1.5], [-3.0, -1.5], [4.0, -2.5], [0.5, 2.5]]):
         query, match = (seen(box((-6, 6), (-4, 4), 3.0, np.array(pillars)), np.eye(4), 9.0) for _ in range(2))
-        found.append(ambiguity(match, query, np.eye(4), 100.0 * np.eye(6))["rival_far"])
+        found.append(ambiguity(match, query, np.eye(4), SIDEWAYS)["rival_far"])
     assert found[0] < 0.1 < found[1]
 
 

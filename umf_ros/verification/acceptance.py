@@ -121,8 +121,7 @@ def _in_passage(measurements: Measurements) -> bool:
 def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
     """Why a hypothesis is no closure however probable, with figures; None when nothing refutes it."""
     if kind_of(measurements) == IMAGE:
-        repeated = measurements["residual_sigmas"] < const.REPEATED_IMAGE
-        return (RejectReason.REPEATED_IMAGE, "") if repeated else None
+        return (RejectReason.REPEATED_IMAGE, "") if measurements["residual_sigmas"] < const.REPEATED_IMAGE else None
     if measurements.get("lead", math.nan) < 1.0:
         return RejectReason.PASSAGE if _in_passage(measurements) else RejectReason.AMBIGUOUS, ""
     if measurements.get("repetition", math.nan) < const.MIN_REPETITION:
@@ -132,7 +131,7 @@ def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
     unexplained = measurements.get("unexplained", math.nan)
     if measurements.get("merged", 1.0) > 1 and "narrow" not in measurements and unexplained > const.SUBMAP_UNEXPLAINED:
         return RejectReason.UNEXPLAINED, f"{unexplained:.0%}"
-    return (RejectReason.AMBIGUOUS, "") if measurements.get("runner_up", math.nan) < const.MIN_LEAD else None
+    return None
 
 
 @dataclass(frozen=True, slots=True)

@@ -103,23 +103,19 @@ class GridMap:
         return np.asarray(_spectra_of(turned**power).conj())
 
 
-def terrain_fit(match: GridMap, query: GridMap, pose: Array) -> tuple[float, float, float]:
-    """How well the relief of two maps fits at a pose.
+def terrain_fit(match: GridMap, query: GridMap, pose: Array) -> float:
+    """How well the relief of two maps fits at a pose: their correlation, in standard deviations of chance.
 
     Args:
         match: map of the matched scan.
         query: map of the query's scan.
         pose: (4, 4) `match_T_query` between the upright frames.
-
-    Returns:
-        Correlation, -1 to 1; the same in standard deviations of chance; standard deviation of the match's relief, m.
     """
     ours, theirs = _shared_relief(match, query, pose)
     if len(ours) < const.FEWEST_POINTS:
-        return 0.0, 0.0, float(theirs.std()) if len(theirs) else 0.0
-    norm = float(np.sqrt((ours**2).sum() * (theirs**2).sum()))
-    correlation = float((ours * theirs).sum()) / max(norm, 1e-9)
-    return correlation, correlation * math.sqrt(len(ours)), float(theirs.std())
+        return 0.0
+    norm = math.sqrt(float((ours**2).sum() * (theirs**2).sum()) / len(ours))
+    return float((ours * theirs).sum()) / max(norm, 1e-9)
 
 
 def relief_misfit(match: GridMap, query: GridMap, pose: Array) -> float:

@@ -7,14 +7,13 @@ A new test is three steps: a number in one of the functions below with its meani
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
 from umf_ros.core.geometry import Array
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import terrain_fit
-from umf_ros.verification.hypothesis import IMAGE, Hypothesis, known_only, same_pose
+from umf_ros.verification.hypothesis import Hypothesis, known_only
 from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled
 from umf_ros.verification.scan_alignment import (
     NOMINAL,
@@ -37,9 +36,7 @@ MEASUREMENTS = {
     "points": "points that have a counterpart",
     "merged": "scans behind the larger of two submaps; 1 where two single scans were aligned",
     "narrow": "1 where a submap is of a sensor that sees little around it; submaps then show different sides",
-    "terrain_correlation": "correlation of the relief of both scans, -1 to 1",
-    "terrain_score": "the same in standard deviations of chance",
-    "relief_m": "standard deviation of the relief on the ground that both scans saw",
+    "terrain_score": "correlation of the relief of both scans, in standard deviations of chance",
     "common": "share of a scan's points that the other should see, the smaller of both ways, as all that follow",
     "contradiction": "share of these that the other's rays passed by, the larger of both",
     "counterparts": "share of these that have a counterpart",
@@ -52,7 +49,6 @@ MEASUREMENTS = {
     "repetition": "logarithm of how much worse what stands around the query fits itself elsewhere than the match here",
     "beyond_walls": "of what stands and both scans see, the share off its three largest planes",
     "lead": "how much worse points, or surfaces of scans in a passage, fit elsewhere; a closure needs 1",
-    "runner_up": "logarithm of how much more is missing at the next best hypothesis about the pair",
     "pose_inliers": "feature pairs that agree with the pose",
     "residual_sigmas": "errors of reprojection in standard deviations of the features' noise",
     "spread": "of the pairs across the image: smaller deviation of column and row, as a share of width and height",
@@ -80,22 +76,6 @@ def measure(hypothesis: Hypothesis) -> dict[str, float]:
     return known_only(found)
 
 
-def runner_up(hypothesis: Hypothesis, others: Sequence[Hypothesis]) -> dict[str, float]:
-    """Return the lead of a hypothesis over others about the same candidate that end elsewhere, in what is missing."""
-    pose = hypothesis.pose
-    distinct = [_missing(one) for one in others if not same_pose(pose, one.pose)]
-    if hypothesis.kind == IMAGE or not distinct:
-        return {}
-    floor = const.MISFIT_FLOOR
-    return {"runner_up": math.log((min(distinct) + floor) / (_missing(hypothesis) + floor))}
-
-
-def _missing(hypothesis: Hypothesis) -> float:
-    """Share of all that stands, or where nothing does of all points, that should have a counterpart and has none."""
-    measurements = hypothesis.measurements
-    return 1.0 - measurements.get("upright_counterparts", measurements["counterparts"])
-
-
 def closure_covariance(hypothesis: Hypothesis, model: CovarianceModel) -> Array:
     """Covariance (6, 6) of the pose in ROS order, match axes, m^2 and rad^2."""
     query, match = hypothesis.keyframes
@@ -108,8 +88,6 @@ def closure_covariance(hypothesis: Hypothesis, model: CovarianceModel) -> Array:
 
 
 def _measure_scans(alignment: Alignment, match: PreparedScan, query: PreparedScan) -> dict[str, float]:
-    level = levelled(match, query, alignment.pose)
-    correlation, score, relief_m = terrain_fit(match.terrain, query.terrain, level)
     size = np.abs(alignment.residuals) if len(alignment.residuals) else np.full(1, const.FINE_REACH_M)
     return {
         "residual_m": float(np.median(size)),
@@ -118,9 +96,7 @@ def _measure_scans(alignment: Alignment, match: PreparedScan, query: PreparedSca
         "overlap": alignment.overlap,
         "points": float(len(alignment.residuals)),
         "merged": float(max(match.merged, query.merged)),
-        "terrain_correlation": correlation,
-        "terrain_score": score,
-        "relief_m": relief_m,
+        "terrain_score": terrain_fit(match.terrain, query.terrain, levelled(match, query, alignment.pose)),
         **({"narrow": 1.0} if match.narrow or query.narrow else {}),
         **compare_scans(match, query, alignment.pose),
     }

@@ -8,7 +8,8 @@ other scan alone, so that no ring meets itself. A point's distance is that to a 
 before the walls are no planes: their points are compared with points.
 
 The evidence for a position is how much worse all points together fit elsewhere, at the rival where that is least. How
-much the sums differ from one rival to the next shows what chance does in such a place.
+much the sums differ from one rival to the next shows what chance does in such a place. The pattern of some sensors
+never comes again: of these, points compared with points are evidence too.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, evenly, invert, make_pose, near, transform
 from umf_ros.verification import constants as const
-from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur
+from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur, same_rays, submaps
 from umf_ros.verification.scan_alignment import run_gicp
 from umf_ros.verification.scan_consistency import (
     ambiguity,
@@ -31,6 +32,7 @@ from umf_ros.verification.scan_consistency import (
     mean_misfits,
     off_walls,
     patterned,
+    point_leads,
     shifted,
     upright_sample,
 )
@@ -80,11 +82,13 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: 
     # about this place the alignment knows better where it is than planes do
     stays = abs((pose[:3, 3] - fits.poses[first, :3, 3]) @ way) <= const.PASSAGE_BESIDE_M
     here, least = pose if stays else fits.poses[first], const.TURNED_EVIDENCE if turned else const.PASSAGE_EVIDENCE
-    evidence = min(float(told.min()), comparison.evidence_of_tilt(here))
-    return Position(here, evidence, max(least, const.PASSAGE_CONTRAST * float(told.std())), comparison)
+    needed = max(least, const.PASSAGE_CONTRAST * float(told.std()))
+    return Position(here, float(told.min()), needed, comparison, turned)
 
 
-def compare_elsewhere(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> dict[str, float]:
+def compare_elsewhere(
+    match: PreparedScan, query: PreparedScan, pose: Array, information: Array, others: Sequence[Array]
+) -> dict[str, float]:
     """Return `ambiguity`, whose `lead` has to hold against tilted poses as well.
 
     Before a front, a sensor that sees a fan leaves open how far it is tilted in the front's plane, and points of two
@@ -95,12 +99,14 @@ def compare_elsewhere(match: PreparedScan, query: PreparedScan, pose: Array, inf
         query: the query's scan.
         pose: (4, 4) `match_T_query`.
         information: (6, 6) of the alignment.
+        others: poses (4, 4) at which the scans could lie as well.
     """
-    found = ambiguity(match, query, pose, information)
+    way = least_known(information)
+    found = ambiguity(match, query, pose, way, others)
     if found.get("lead", 0.0) >= 1.0 and patterned(match, query) and _fans(match, query):
-        way = least_known(information)
         comparison = Comparison(match, query, way, shifted(pose, way, const.PASSAGE_SHIFTS_M))
-        found["lead"] = min(found["lead"], comparison.evidence_of_tilt(pose) / const.PASSAGE_EVIDENCE)
+        position = Position(pose, np.inf, const.PASSAGE_EVIDENCE, comparison, False)
+        found["lead"] = min(found["lead"], position.lead_over([]))
     return found
 
 
@@ -121,7 +127,11 @@ class Comparison:
     def __init__(self, match: PreparedScan, query: PreparedScan, way: Array, along: Array) -> None:
         self.way = way
         self._scans = match, query
-        self._flat = _surfaces(query), _surfaces(match)
+        kept = const.SAMPLE // 2
+        ours, theirs = (
+            [half.points[evenly(len(half.points), kept)] for half in it.surfaces[::-1]] for it in (query, match)
+        )
+        self._flat = ours, theirs
         self._standing = _standing(query), _standing(match)
         misfits, seen = self._of_points(along)
         overall = misfits.sum() / max(int(seen.sum()), 1)
@@ -145,22 +155,32 @@ class Comparison:
             _means(misfits, known),
         )
 
-    def evidence_of_tilt(self, pose: Array) -> float:
-        """Return the evidence for a pose (4, 4) against those that are tilted about the direction across.
+    def tilted(self, pose: Array) -> list[Array]:
+        """Return poses (4, 4) that are tilted about the direction across; none for sensors that see more than a fan.
 
         By 5 to 8 deg, and by more where what is seen nearby would move by less than half a metre. One front leaves
-        that open to a sensor that sees a fan; infinite for others.
+        that open to a sensor that sees a fan.
         """
         if not _fans(*self._scans):
-            return np.inf
+            return []
         ours, theirs = self._standing
         placed = [transform(pose, half) for half in ours] + theirs
         middle = np.concatenate([*placed, pose[None, :3, 3]]).mean(axis=0)
         across = np.cross(self._scans[0].up[2], self.way)
         tilts = const.RIVAL_NEAR_M / min(const.TILTED_REACH_M, *(scan.reach_m for scan in self._scans))
         turns = Rotation.from_rotvec(tilts[:, None] * across / np.linalg.norm(across)).as_matrix()
-        tilted = [make_pose(turn, middle - turn @ middle) @ pose for turn in turns]
-        return float(self.fits(np.stack([pose, *tilted])).evidence(0)[1:].min())
+        return [make_pose(turn, middle - turn @ middle) @ pose for turn in turns]
+
+    def leads_by_points(self, pose: Array, rivals: Sequence[Array]) -> Array:
+        """(R + 1,) how much worse points that stand up fit at each rival, and elsewhere, as shares of a clear lead.
+
+        Where the pattern of a sensor is in both scans, points do not tell.
+        """
+        if submaps(*self._scans) or same_rays(*self._scans):
+            return np.full(len(rivals) + 1, -np.inf)
+        leads = point_leads(*self._scans, np.stack([pose, *rivals])) / const.MIN_LEAD
+        elsewhere = ambiguity(*self._scans, pose, self.way).get("lead", np.nan)
+        return np.nan_to_num(np.append(leads, elsewhere) / const.CLEAR_LEAD)
 
     def _of_planes(self, poses: Array, halves: Halves) -> Misfits:
         """Misfits of points of both scans with surfaces of the other, 1 in space that it saw empty."""
@@ -193,17 +213,27 @@ class Position(NamedTuple):
         evidence: how much worse points fit at the best rival, as a number of points that fit here and not there.
         needed: the evidence that a closure needs.
         comparison: of the two scans.
+        turned: whether it is turned round to what is expected.
     """
 
     pose: Array
     evidence: float
     needed: float
     comparison: Comparison
+    turned: bool
 
     def lead_over(self, poses: Sequence[Array]) -> float:
-        """Return the evidence, also against other poses (4, 4) of the scans, as a share of what a closure needs."""
-        against = self.comparison.fits(np.stack([self.pose, *poses])).evidence(0)[1:] if poses else np.empty(0)
-        return float(against.min(initial=self.evidence)) / self.needed
+        """Return the evidence as a share of what a closure needs, also against tilted poses and these (4, 4).
+
+        Where surfaces tell too little, a clear lead by points is enough if the sensor's pattern is not in both scans,
+        but for poses that are turned round.
+        """
+        rivals = [*self.comparison.tilted(self.pose), *poses]
+        told = self.comparison.fits(np.stack([self.pose, *rivals])).evidence(0)[1:]
+        leads = np.append(told, self.evidence) / self.needed
+        if leads.min() < 1.0 and not self.turned:
+            leads = np.maximum(leads, self.comparison.leads_by_points(self.pose, rivals))
+        return float(leads.min())
 
     def compared(self, pose: Array) -> bool:
         """Whether a pose (4, 4), up to its position along the passage, is this one: it was compared with it."""
@@ -229,13 +259,10 @@ class _Fits(NamedTuple):
     there: NDArray[np.bool_]
     means: Array
 
-    def worse(self, number: int) -> Array:
-        """(K, N) how much worse points fit at each pose than at one of them."""
-        return np.where(self.here[number] & self.there, self.misfits - self.misfits[number], 0.0)
-
     def evidence(self, number: int) -> Array:
         """(K,) the sum over the points, or over those alone that no ray passed by, if that is less: others may move."""
-        worse, passed = self.worse(number), self.misfits == 1.0  # of what stands before the walls none is that large
+        worse = np.where(self.here[number] & self.there, self.misfits - self.misfits[number], 0.0)
+        passed = self.misfits == 1.0  # of what stands before the walls none is that large
         stayed = np.where(passed | passed[number], 0.0, worse)
         return np.asarray(np.minimum(worse.sum(axis=1), stayed.sum(axis=1)))
 
@@ -258,18 +285,13 @@ def _best(fits: _Fits, way: Array, count: int) -> tuple[int, Array]:
         first = rival
 
 
-def _surfaces(scan: PreparedScan) -> list[Array]:
-    """Some points (N, 3) of each half of a scan, as in `Halves`."""
-    return [half.points[evenly(len(half.points), const.SAMPLE // 2)] for half in reversed(scan.surfaces)]
-
-
 def _standing(scan: PreparedScan) -> list[Array]:
     """Some points (N, 3) of each half of a scan, as in `Halves`, that are off its walls and its ground."""
     walls, found = largest_walls(*upright_sample(scan)), []
     height = scan.points @ scan.up[2]
     ground_m = np.quantile(height, const.GROUND_SHARE) + const.THIN_CELL_M
     for half in reversed(scan.surfaces):
-        level = half.planar & (np.abs(half.normals @ scan.up[2]) > const.LEVEL_COS)
+        level = half.planar & (2 * (half.normals @ scan.up[2]) ** 2 > 1.0)
         near = half.reach_m < const.STANDING_REACH_M
         stands = near & ~level & off_walls(half.points, walls, 2 * const.WALL_M) & (half.points @ scan.up[2] > ground_m)
         points = half.points[stands]
@@ -293,6 +315,7 @@ def _peaks(means: Array) -> list[int]:
     """The best of the shifts along a passage, a metre and more apart from each other, by their mean misfits."""
     picks: list[int] = []
     for number in np.argsort(means).tolist():
-        if len(picks) < const.PASSAGE_RIVALS and all(abs(number - other) >= const.PASSAGE_APART for other in picks):
+        apart_m = np.abs(const.PASSAGE_SHIFTS_M[picks] - const.PASSAGE_SHIFTS_M[number])
+        if len(picks) < const.PASSAGE_RIVALS and (apart_m >= const.DISTINCT_M).all():
             picks.append(number)
     return picks

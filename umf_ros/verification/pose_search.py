@@ -90,12 +90,12 @@ def coarse_align(match: PreparedScan, query: PreparedScan, guesses: Sequence[Arr
     """
     poses = _by_scouts(match, query, guesses)
     reach_m = const.SCOUT_NEAR * query.cell_m
-    there = _found_shares(match, query.scouts, poses, reach_m)
-    back = _found_shares(query, match.scouts, [invert(pose) for pose in poses], reach_m)
+    there = _found_shares(match, query.oriented_scouts.points, poses, reach_m)
+    back = _found_shares(query, match.oriented_scouts.points, [invert(pose) for pose in poses], reach_m)
     known = structured(match, query)
     fits = []
     for pose, share in zip(poses, (there + back) / 2, strict=True):
-        terrain = terrain_fit(match.terrain, query.terrain, levelled(match, query, pose))[1]
+        terrain = terrain_fit(match.terrain, query.terrain, levelled(match, query, pose))
         if known or terrain >= const.MIN_MAP_SCORE:
             fits.append(Fit(pose, float(share), terrain))
     return fits

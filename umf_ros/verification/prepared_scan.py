@@ -10,6 +10,7 @@ from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from umf_ros.core.frames import Frame, Keyframe, Points, ScanMotion
 from umf_ros.core.geometry import Array, evenly, invert, make_pose, median_range, transform
@@ -247,15 +248,10 @@ class PreparedScan:
         """(S, 3) unit normals of the sample, those on a single ring too."""
         return self.tree.normals(self.sample, 2 * const.NEIGHBOURS)
 
-    @property
-    def scouts(self) -> Array:
-        """(S / 5, 3) m: every fifth of the sample, enough for the far-sighted steps."""
-        return self.sample[:: const.SCOUT_EVERY]
-
     @cached_property
     def oriented_scouts(self) -> OrientedPoints:
-        """The few with normals of their own."""
-        return OrientedPoints.of(self.scouts)
+        """Every fifth of the sample, enough for the far-sighted steps."""
+        return OrientedPoints.of(self.sample[:: const.SCOUT_EVERY])
 
     @cached_property
     def spacing(self) -> Array:
@@ -277,6 +273,12 @@ class PreparedScan:
         elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
         odd = (np.floor(elevation / const.SIGHT_DEG) % 2).astype(bool)
         return Surfaces.of(self.points[~odd]), Surfaces.of(self.points[odd])
+
+    @cached_property
+    def rays(self) -> Array:
+        """(M, 3) unit vectors to the points of a single scan, LiDAR frame."""
+        seen = transform(self._lidars_T_body[0], self.points)
+        return np.asarray(seen / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-9))
 
     @cached_property
     def passage(self) -> Array | None:
@@ -319,6 +321,18 @@ def views_decide(match: PreparedScan, query: PreparedScan) -> bool:
 def structured(match: PreparedScan, query: PreparedScan) -> bool:
     """Whether enough stands up from the ground around both to tell one place from another."""
     return all(scan.map(query.cell_m).structured for scan in (match, query))
+
+
+def same_rays(match: PreparedScan, query: PreparedScan) -> bool:
+    """Whether the rays of two single scans lie nearer to each other than after a turn of the sensor by a degree.
+
+    Those of rings do. Those of a scanner whose pattern never comes again do not, and its points tell positions apart.
+    """
+    turn = np.radians(const.SIGHT_DEG / 2)
+    turns = Rotation.from_rotvec([[0, 0, 0], [turn, 0, 0], [-turn, 0, 0], [0, turn, 0], [0, -turn, 0]]).as_matrix()
+    turned = (query.rays[evenly(len(query.rays), const.SAMPLE)] @ turns).reshape(-1, 3)
+    here, *others = np.median(kernels.KdTree(match.rays).nearest(turned)[1].reshape(len(turns), -1), axis=1)
+    return bool(here < const.NO_PATTERN**2 * np.mean(others))
 
 
 def submaps(match: PreparedScan, query: PreparedScan) -> bool:

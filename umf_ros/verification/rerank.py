@@ -75,11 +75,7 @@ def fit_rigid(a: Array, b: Array, threshold: float, iterations: int, seed: int) 
 
 Indices = NDArray[np.intp]
 Fit = Callable[[Array, Array, float, int, int], Consensus | None]
-WITHOUT: dict[str, Any] = {
-    "both": {},
-    "image": {"cloud": None, "super_cloud": None},
-    "cloud": {"image": None, "super_image": None},
-}
+WITHOUT: dict[str, Any] = {"both": {}, "image": {"cloud": None}, "cloud": {"image": None}}
 """Features that a choice of modalities takes out of an embedding."""
 Offered = tuple[Candidate, Keyframe]
 """A candidate with its keyframe."""

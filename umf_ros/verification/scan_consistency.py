@@ -8,12 +8,15 @@ nothing stands, positions are told by the relief of the ground.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from umf_ros.core.geometry import Array, cubes, evenly, invert, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.grid_map import relief_misfit
+from umf_ros.verification.hypothesis import known_only
 from umf_ros.verification.pose_search import alternatives
 from umf_ros.verification.prepared_scan import PreparedScan, common_blur, levelled, structured, submaps
 from umf_ros.verification.scan_alignment import SEARCHED
@@ -129,15 +132,17 @@ def least_known(information: Array) -> Array:
     return np.append(np.linalg.eigh(np.linalg.inv(information + SEARCHED)[:2, :2])[1][:, -1], 0.0)
 
 
-def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information: Array) -> dict[str, float]:
+def ambiguity(
+    match: PreparedScan, query: PreparedScan, pose: Array, way: Array, others: Sequence[Array] = ()
+) -> dict[str, float]:
     """Return how much worse two scans fit at other poses, as logarithms of the ratio of their misfits.
 
     The misfit is the mean of points that stand up from the ground, for rings of a scanner lie on bare ground alike
     wherever it stands; where next to nothing stands, the share of relief that is not explained.
 
-    - `rival_near`: half a metre on, along the direction in which the position is known least;
-    - `rival_far`: at the best pose 1 to 6 m on, and at the other peaks of the search at the same heading;
-    - `lead`: the smaller of both as a share of what a closure needs. Unknown where next to nothing stands.
+    - `rival_near`: half a metre on along a direction;
+    - `rival_far`: at the best pose 1 to 6 m on, at the other peaks of the search at the same heading, and at `others`;
+    - `lead`: the smaller of both as a share of what a closure needs; where little stands, that at `others` alone.
 
     0 when another pose fits as well. In a passage, where points follow the sensor's pattern, `passages` decides.
 
@@ -145,21 +150,32 @@ def ambiguity(match: PreparedScan, query: PreparedScan, pose: Array, information
         match: the matched scan.
         query: the query's scan.
         pose: (4, 4) `match_T_query`.
-        information: (6, 6) of the alignment.
+        way: (3,) the direction, in which the position is known least.
+        others: poses (4, 4) at which the scans could lie as well.
     """
-    way = least_known(information)
     beside, along = (shifted(pose, way, shifts) for shifts in (const.RIVAL_NEAR_M, const.RIVAL_FAR_M))
     poses = np.stack([pose, *beside, *along, *alternatives(match, query, pose)])
-    misfits = _mean_point_misfit(match, query, poses) if structured(match, query) else np.array([np.nan])
-    stands = bool(np.isfinite(misfits[0]))
-    if stands:
-        misfits = np.where(np.isfinite(misfits), misfits, const.RIVAL_MISFIT)
-    else:
+    by_points = leads = point_leads(match, query, np.stack([*poses, *others]))
+    if not (stands := structured(match, query) and bool(np.isfinite(leads[0]))):
         level = [levelled(match, query, one) for one in poses]
-        misfits = np.array([relief_misfit(match.terrain, query.terrain, one) for one in level])
-    fit, far = np.log(np.maximum(misfits, const.MISFIT_FLOOR)), 1 + len(beside)
-    found = {"rival_near": float(fit[1:far].min() - fit[0]), "rival_far": float(fit[far:].min() - fit[0])}
-    return found | ({"lead": min(found.values()) / const.MIN_LEAD} if stands else {})
+        leads = _leads(np.array([relief_misfit(match.terrain, query.terrain, one) for one in level]))
+    least = np.fmin.reduce(by_points if stands else by_points[len(poses) - 1 :], initial=np.nan)
+    found = {"rival_near": leads[: len(beside)].min(), "rival_far": leads[len(beside) :].min()}
+    return known_only({name: float(one) for name, one in (found | {"lead": least / const.MIN_LEAD}).items()})
+
+
+def point_leads(match: PreparedScan, query: PreparedScan, poses: Array) -> Array:
+    """(K - 1,) how much worse points that stand up fit than at the first of poses (K, 4, 4); NaN where nothing stands.
+
+    Logarithms of the ratio of misfits.
+    """
+    return _leads(_mean_point_misfit(match, query, poses))
+
+
+def _leads(misfits: Array) -> Array:
+    """(K - 1,) logarithms of misfits over the first of them (K,); of others that are unknown, the worst counts."""
+    others = np.where(np.isfinite(misfits[1:]), misfits[1:], const.RIVAL_MISFIT)
+    return np.asarray(np.log(np.maximum(others, const.MISFIT_FLOOR) / np.maximum(misfits[0], const.MISFIT_FLOOR)))
 
 
 def patterned(match: PreparedScan, query: PreparedScan) -> bool:

@@ -15,7 +15,7 @@ from umf_ros.core.geometry import Array, heading, invert, relative
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
-from umf_ros.verification.measurement import closure_covariance, measure, runner_up
+from umf_ros.verification.measurement import closure_covariance, measure
 from umf_ros.verification.passages import Position, compare_elsewhere, locate_along
 from umf_ros.verification.pose_search import (
     RotatedMaps,
@@ -180,27 +180,25 @@ class Verifier:
             promises = self._promises(one, least)
             if any(other.candidate is one.candidate and found.compared(one.pose) for other, found in passages):
                 continue
-            found = self._look_elsewhere(one) if promises else None
-            # those along the passage have been compared
-            rivals = [] if found else [other for other in aligned if other.candidate is one.candidate]
-            one.measurements |= runner_up(one, rivals)
-            if promises:
-                one.measurements |= excess_differences(one.scans[0], one.scans[1], one.pose)
             judged.append(one)
-            if found:
-                passages.append((one, found))
+            if promises:
+                rivals = [other.pose for other in aligned if other.candidate is one.candidate]
+                found = self._look_elsewhere(one, [pose for pose in rivals if not same_pose(pose, one.pose)])
+                passages += [(one, found)] if found else []
+                one.measurements |= excess_differences(one.scans[0], one.scans[1], one.pose)
             one.probability = self._probability(one)
             if one.scans and self._objection(one) is None:
                 one.measurements |= self._commonplace(one)
         for one, found in passages:  # those at another heading are rivals
-            rivals = [other for other, _ in passages if other is not one and other.candidate is one.candidate]
-            one.measurements["lead"] = found.lead_over([other.pose for other in rivals])
+            rivals = [other.pose for other, _ in passages if other is not one and other.candidate is one.candidate]
+            one.measurements["lead"] = found.lead_over(rivals)
         return judged
 
     def _promises(self, hypothesis: Hypothesis, least: float) -> bool:
         """Whether a hypothesis of scans can be so probable: it is, if no other pose fits the scans."""
-        unrivalled = hypothesis.measurements | WITHOUT_RIVALS
-        return bool(hypothesis.scans) and self._acceptance.probability(unrivalled) >= least
+        return (
+            bool(hypothesis.scans) and self._acceptance.probability(hypothesis.measurements | WITHOUT_RIVALS) >= least
+        )
 
     def _measure(self, hypothesis: Hypothesis) -> None:
         """Measure the pose; nothing stays of a pose that was measured before."""
@@ -208,7 +206,7 @@ class Verifier:
         of_pose = measure(hypothesis) | {"support": self._memory.support(query, match, hypothesis.pose)}
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
-    def _look_elsewhere(self, hypothesis: Hypothesis) -> Position | None:
+    def _look_elsewhere(self, hypothesis: Hypothesis, rivals: list[Array]) -> Position | None:
         """Compare with other poses; of scans in a passage, move to the best position along it, and return that."""
         theirs, ours = hypothesis.scans
         assert hypothesis.alignment is not None
@@ -216,7 +214,7 @@ class Verifier:
         found = locate_along(theirs, ours, hypothesis.pose, _is_turned(query, match, hypothesis.pose))
         if found is None:
             hypothesis.measurements |= compare_elsewhere(
-                theirs, ours, hypothesis.pose, hypothesis.alignment.information
+                theirs, ours, hypothesis.pose, hypothesis.alignment.information, rivals
             )
             return None
         if found.pose is not hypothesis.pose:
@@ -228,11 +226,10 @@ class Verifier:
     @staticmethod
     def _commonplace(hypothesis: Hypothesis) -> dict[str, float]:
         """Measurements of how much the scans show that other places do not."""
-        theirs, ours = hypothesis.scans
-        found = {"beyond_walls": beyond_walls(theirs, ours, hypothesis.pose)}
-        if "rival_far" in hypothesis.measurements:  # in a passage all positions were compared
-            found["repetition"] = repetition(theirs, ours, hypothesis.pose)
-        return known_only(found)
+        (theirs, ours), pose = hypothesis.scans, hypothesis.pose
+        in_passage = "rival_far" not in hypothesis.measurements  # all positions were compared
+        repeated = np.nan if in_passage else repetition(theirs, ours, pose)
+        return known_only({"beyond_walls": beyond_walls(theirs, ours, pose), "repetition": repeated})
 
     def _probability(self, hypothesis: Hypothesis) -> float:
         """That a hypothesis is right; where scans show bare ground alone, nothing would refute a texture seen twice."""

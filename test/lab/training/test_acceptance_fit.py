@@ -72,7 +72,7 @@ def test_decision_lets_no_wrong_pose_of_a_domain_pass_that_it_does_not_know() ->
 def test_a_wrong_pose_with_a_rival_does_not_lower_the_decision() -> None:
     """It is refused anyway."""
     known = in_domains(np.random.default_rng(3))
-    beside = LOOKALIKE | {"runner_up": 0.0}
+    beside = LOOKALIKE | {"lead": 0.0}
     rivalled = [replace(one, measurements=beside) if one.measurements is LOOKALIKE else one for one in known]
     assert fit_decision(rivalled, SCAN, 0.9)[0].bias > fit_decision(known, SCAN, 0.9)[0].bias
 

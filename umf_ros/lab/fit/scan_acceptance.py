@@ -37,8 +37,8 @@ from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
 from umf_ros.verification.acceptance import CRITERIA, AcceptanceModel, Logistic, Measurements, load_acceptance, refuted
-from umf_ros.verification.hypothesis import SCAN, SUBMAP, Hypothesis
-from umf_ros.verification.measurement import measure, runner_up
+from umf_ros.verification.hypothesis import SCAN, SUBMAP, Hypothesis, same_pose
+from umf_ros.verification.measurement import measure
 from umf_ros.verification.passages import compare_elsewhere
 from umf_ros.verification.prepared_scan import PreparedScan
 from umf_ros.verification.rerank import rerank
@@ -152,9 +152,9 @@ def _aligned(
 ) -> tuple[Array, Measurements]:
     alignment = align_scans(*scans, guess)
     hypothesis = Hypothesis.of(tried.query, ranked, tried.match, pose=alignment.pose, scans=scans, alignment=alignment)
-    found = measure(hypothesis) | compare_elsewhere(*scans, alignment.pose, alignment.information)
-    hypothesis.measurements |= found | excess_differences(*scans, alignment.pose)
-    return alignment.pose, hypothesis.measurements | runner_up(hypothesis, others)
+    rivals = [one.pose for one in others if not same_pose(one.pose, alignment.pose)]
+    found = measure(hypothesis) | compare_elsewhere(*scans, alignment.pose, alignment.information, rivals)
+    return alignment.pose, hypothesis.measurements | found | excess_differences(*scans, alignment.pose)
 
 
 def _between_worlds(places: list[ScannedPlace], rng: np.random.Generator) -> ScanPair:
