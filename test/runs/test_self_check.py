@@ -67,8 +67,10 @@ def test_a_lone_wrong_closure_is_named_by_the_overlap_beside_it() -> None:
     scans = with_scans(right)
     good, bad = judged(right, scans), judged(wrong, scans)
     assert good.overlaps[0] > good.beside[0] > 0 and good.probabilities[0] > 0.5 and not good.doubted
-    assert bad.overlaps[0] < good.overlaps[0] and bad.doubted == [0]
-    assert "overlap" in bad.describe(0)
+    assert bad.overlaps[0] < good.overlaps[0] and bad.doubted == [0] and "overlap" in bad.describe(0)
+    # maps that show nothing in common
+    apart = judged(right, {stamp: points + np.float32(100 * (stamp > LAP * 10**9)) for stamp, points in scans.items()})
+    assert np.isnan(apart.overlaps).all() and not apart.doubted
 
 
 def test_a_run_without_closures_has_nothing_to_judge() -> None:

@@ -70,7 +70,8 @@ class SelfCheck:
         closures: those with odometry at both keyframes.
         probabilities: (N,) that each is right.
         support: (N,) nats by which closures of other places agree with it; negative: they contradict it.
-        overlaps: (N,) share of matched points of its local maps; NaN without scans.
+        overlaps: (N,) share of matched points of its local maps; NaN without scans, and where they show nothing in
+            common, as those of a narrow sensor that looks the other way.
         beside: (N,) the largest at poses 1 to 3 m beside.
     """
 
@@ -167,12 +168,13 @@ def judge(
 
 
 def _by_overlap(overlaps: Array) -> Array:
-    """Return (N,) log-odds of closures by their overlap and that beside (N, 2); usual ones without scans."""
+    """Return (N,) log-odds of closures by their overlap and that beside (N, 2); usual ones where no scans tell."""
     known = overlaps[np.isfinite(overlaps[:, 0])]
     # what a sensor can reach differs: most closures are taken for right
     usual = max(float(np.quantile(known[:, 0], _REACHED)), _LEAST_REACHED) if len(known) else 1.0
     odds = _OFFSET + _BY_OVERLAP * np.minimum(overlaps[:, 0] / usual, 1.0)
-    return np.nan_to_num(odds + _BY_CONTRAST * (overlaps[:, 0] - overlaps[:, 1]), nan=_USUAL)
+    unknown = 0.0 if len(known) else _USUAL
+    return np.nan_to_num(odds + _BY_CONTRAST * (overlaps[:, 0] - overlaps[:, 1]), nan=unknown)
 
 
 def _listener(closures: Closures, row: int, settings: PoseGraphSettings) -> Callable[[Array], float]:
@@ -241,7 +243,10 @@ def _local_map(
 
 
 def _overlap(theirs: NDArray[np.floating], ours: NDArray[np.floating], match_T_query: Array) -> tuple[float, float]:
-    """Return the share of our points with one of theirs near, where both see something, and the largest beside."""
+    """Return the share of our points with one of theirs near, where both see something, and the largest beside.
+
+    NaN where both see next to nothing.
+    """
     moved = (transform(match_T_query, ours) + _SHIFTS_M[:, None]).astype(np.float32)
     inside = np.isin(_columns(moved.reshape(-1, 3)), np.unique(_columns(theirs))).reshape(moved.shape[:2])
     near = np.zeros(inside.shape, bool)
@@ -249,7 +254,7 @@ def _overlap(theirs: NDArray[np.floating], ours: NDArray[np.floating], match_T_q
     near[inside] = tree.nearest(np.ascontiguousarray(moved[inside]), _NEAR_M)[1] < _NEAR_M**2
     counts = inside.sum(axis=1)
     shares = np.where(counts < _FEWEST, 0.0, near.sum(axis=1) / np.maximum(counts, 1))
-    return float(shares[0]), float(shares[1:].max())
+    return (float(shares[0]), float(shares[1:].max())) if counts[0] >= _FEWEST else (np.nan, np.nan)
 
 
 def _columns(points: NDArray[np.floating]) -> NDArray[np.int64]:
