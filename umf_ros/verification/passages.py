@@ -229,7 +229,7 @@ class Position(NamedTuple):
         but for poses that are turned round.
         """
         rivals = [*self.comparison.tilted(self.pose), *poses]
-        told = self.comparison.fits(np.stack([self.pose, *rivals])).evidence(0)[1:]
+        told = self.comparison.fits(np.stack([self.pose, *rivals])).evidence(0)[1:] if rivals else np.empty(0)
         leads = np.append(told, self.evidence) / self.needed
         if leads.min() < 1.0 and not self.turned:
             leads = np.maximum(leads, self.comparison.leads_by_points(self.pose, rivals))
