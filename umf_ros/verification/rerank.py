@@ -75,7 +75,8 @@ def fit_rigid(a: Array, b: Array, threshold: float, iterations: int, seed: int) 
 
 Indices = NDArray[np.intp]
 Fit = Callable[[Array, Array, float, int, int], Consensus | None]
-WITHOUT: dict[str, Any] = {"both": {}, "image": {"cloud": None}, "cloud": {"image": None}}
+_CLOUD, _IMAGE = dict.fromkeys(("cloud", "super_cloud")), dict.fromkeys(("image", "super_image"))
+WITHOUT: dict[str, Any] = {"both": {}, "image": _CLOUD, "cloud": _IMAGE}
 """Features that a choice of modalities takes out of an embedding."""
 Offered = tuple[Candidate, Keyframe]
 """A candidate with its keyframe."""

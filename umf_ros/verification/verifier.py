@@ -227,8 +227,8 @@ class Verifier:
     def _commonplace(hypothesis: Hypothesis) -> dict[str, float]:
         """Measurements of how much the scans show that other places do not."""
         (theirs, ours), pose = hypothesis.scans, hypothesis.pose
-        in_passage = "rival_far" not in hypothesis.measurements  # all positions were compared
-        repeated = np.nan if in_passage else repetition(theirs, ours, pose)
+        # in a passage all positions were compared
+        repeated = repetition(theirs, ours, pose) if "rival_far" in hypothesis.measurements else np.nan
         return known_only({"beyond_walls": beyond_walls(theirs, ours, pose), "repetition": repeated})
 
     def _probability(self, hypothesis: Hypothesis) -> float:
