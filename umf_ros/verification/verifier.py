@@ -196,9 +196,8 @@ class Verifier:
 
     def _promises(self, hypothesis: Hypothesis, least: float) -> bool:
         """Whether a hypothesis of scans can be so probable: it is, if no other pose fits the scans."""
-        return (
-            bool(hypothesis.scans) and self._acceptance.probability(hypothesis.measurements | WITHOUT_RIVALS) >= least
-        )
+        unrivalled = hypothesis.measurements | WITHOUT_RIVALS
+        return bool(hypothesis.scans) and self._acceptance.probability(unrivalled) >= least
 
     def _measure(self, hypothesis: Hypothesis) -> None:
         """Measure the pose; nothing stays of a pose that was measured before."""
