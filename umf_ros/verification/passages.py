@@ -15,6 +15,7 @@ never comes again: of these, points compared with points are evidence too.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ from umf_ros.verification.scan_consistency import (
     patterned,
     point_leads,
     shifted,
+    steep,
     upright_sample,
 )
 
@@ -69,7 +71,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: 
     if way is None:
         return None
     along = shifted(pose, way, const.PASSAGE_SHIFTS_M)
-    comparison = Comparison(match, query, way, along)
+    comparison = Comparison(match, query, way, along, turned)
     best = along[_peaks(comparison.means_of_some(along))]
     distinct: list[tuple[Array, Array]] = []
     for one in best:  # half of them end where another does: a few points show it
@@ -83,7 +85,7 @@ def locate_along(match: PreparedScan, query: PreparedScan, pose: Array, turned: 
     stays = abs((pose[:3, 3] - fits.poses[first, :3, 3]) @ way) <= const.PASSAGE_BESIDE_M
     here, least = pose if stays else fits.poses[first], const.TURNED_EVIDENCE if turned else const.PASSAGE_EVIDENCE
     needed = max(least, const.PASSAGE_CONTRAST * float(told.std()))
-    return Position(here, float(told.min()), needed, comparison, turned)
+    return Position(here, float(told.min()), needed, comparison)
 
 
 def compare_elsewhere(
@@ -104,9 +106,9 @@ def compare_elsewhere(
     way = least_known(information)
     found = ambiguity(match, query, pose, way, others)
     if found.get("lead", 0.0) >= 1.0 and patterned(match, query) and _fans(match, query):
-        comparison = Comparison(match, query, way, shifted(pose, way, const.PASSAGE_SHIFTS_M))
-        position = Position(pose, np.inf, const.PASSAGE_EVIDENCE, comparison, False)
-        found["lead"] = min(found["lead"], position.lead_over([]))
+        comparison = Comparison(match, query, way, shifted(pose, way, const.PASSAGE_SHIFTS_M), turned=False)
+        leads = comparison.leads(pose, comparison.tilted(pose), const.PASSAGE_EVIDENCE)
+        found["lead"] = float(leads.min(initial=found["lead"]))
     return found
 
 
@@ -122,16 +124,13 @@ class Comparison:
         query: the query's scan.
         way: (3,) direction of the passage, match frame.
         along: (K, 4, 4) poses along the passage.
+        turned: whether these are turned round to what is expected; points do not tell then.
     """
 
-    def __init__(self, match: PreparedScan, query: PreparedScan, way: Array, along: Array) -> None:
+    def __init__(self, match: PreparedScan, query: PreparedScan, way: Array, along: Array, turned: bool) -> None:
         self.way = way
-        self._scans = match, query
-        kept = const.SAMPLE // 2
-        ours, theirs = (
-            [half.points[evenly(len(half.points), kept)] for half in it.surfaces[::-1]] for it in (query, match)
-        )
-        self._flat = ours, theirs
+        self._scans, self._turned = (match, query), turned
+        self._flat = _surfaces(query), _surfaces(match)
         self._standing = _standing(query), _standing(match)
         misfits, seen = self._of_points(along)
         overall = misfits.sum() / max(int(seen.sum()), 1)
@@ -171,16 +170,22 @@ class Comparison:
         turns = Rotation.from_rotvec(tilts[:, None] * across / np.linalg.norm(across)).as_matrix()
         return [make_pose(turn, middle - turn @ middle) @ pose for turn in turns]
 
-    def leads_by_points(self, pose: Array, rivals: Sequence[Array]) -> Array:
-        """(R + 1,) how much worse points that stand up fit at each rival, and elsewhere, as shares of a clear lead.
+    @cached_property
+    def points_tell(self) -> bool:
+        """Whether points tell positions apart: no pattern of a sensor is in both scans."""
+        return not (self._turned or submaps(*self._scans) or same_rays(*self._scans))
 
-        Where the pattern of a sensor is in both scans, points do not tell.
-        """
-        if submaps(*self._scans) or same_rays(*self._scans):
-            return np.full(len(rivals) + 1, -np.inf)
-        leads = point_leads(*self._scans, np.stack([pose, *rivals])) / const.MIN_LEAD
-        elsewhere = ambiguity(*self._scans, pose, self.way).get("lead", np.nan)
-        return np.nan_to_num(np.append(leads, elsewhere) / const.CLEAR_LEAD)
+    def leads(self, pose: Array, rivals: Sequence[Array], needed: float) -> Array:
+        """(R,) evidence for a pose (4, 4) over each rival as a share of what is needed; by points where these tell."""
+        poses = np.stack([pose, *rivals])
+        told = self.fits(poses).evidence(0)[1:] / needed
+        if (told >= 1.0).all() or not self.points_tell:
+            return told
+        return np.fmax(told, point_leads(*self._scans, poses) / (const.CLEAR_LEAD * const.MIN_LEAD))
+
+    def lead_along(self, pose: Array) -> float:
+        """The `lead` of a pose (4, 4) by `ambiguity`, as a share of a clear one."""
+        return ambiguity(*self._scans, pose, self.way).get("lead", 0.0) / const.CLEAR_LEAD
 
     def _of_planes(self, poses: Array, halves: Halves) -> Misfits:
         """Misfits of points of both scans with surfaces of the other, 1 in space that it saw empty."""
@@ -213,14 +218,12 @@ class Position(NamedTuple):
         evidence: how much worse points fit at the best rival, as a number of points that fit here and not there.
         needed: the evidence that a closure needs.
         comparison: of the two scans.
-        turned: whether it is turned round to what is expected.
     """
 
     pose: Array
     evidence: float
     needed: float
     comparison: Comparison
-    turned: bool
 
     def lead_over(self, poses: Sequence[Array]) -> float:
         """Return the evidence as a share of what a closure needs, also against tilted poses and these (4, 4).
@@ -228,12 +231,11 @@ class Position(NamedTuple):
         Where surfaces tell too little, a clear lead by points is enough if the sensor's pattern is not in both scans,
         but for poses that are turned round.
         """
-        rivals = [*self.comparison.tilted(self.pose), *poses]
-        told = self.comparison.fits(np.stack([self.pose, *rivals])).evidence(0)[1:] if rivals else np.empty(0)
-        leads = np.append(told, self.evidence) / self.needed
-        if leads.min() < 1.0 and not self.turned:
-            leads = np.maximum(leads, self.comparison.leads_by_points(self.pose, rivals))
-        return float(leads.min())
+        along, comparison = self.evidence / self.needed, self.comparison
+        if along < 1.0 and comparison.points_tell:
+            along = max(along, comparison.lead_along(self.pose))
+        rivals = [*comparison.tilted(self.pose), *poses]
+        return float(comparison.leads(self.pose, rivals, self.needed).min(initial=along)) if rivals else along
 
     def compared(self, pose: Array) -> bool:
         """Whether a pose (4, 4), up to its position along the passage, is this one: it was compared with it."""
@@ -285,13 +287,18 @@ def _best(fits: _Fits, way: Array, count: int) -> tuple[int, Array]:
         first = rival
 
 
+def _surfaces(scan: PreparedScan) -> list[Array]:
+    """Some points (N, 3) of each half of a scan, as in `Halves`."""
+    return [half.points[evenly(len(half.points), const.SAMPLE // 2)] for half in reversed(scan.surfaces)]
+
+
 def _standing(scan: PreparedScan) -> list[Array]:
     """Some points (N, 3) of each half of a scan, as in `Halves`, that are off its walls and its ground."""
     walls, found = largest_walls(*upright_sample(scan)), []
     height = scan.points @ scan.up[2]
     ground_m = np.quantile(height, const.GROUND_SHARE) + const.THIN_CELL_M
     for half in reversed(scan.surfaces):
-        level = half.planar & (2 * (half.normals @ scan.up[2]) ** 2 > 1.0)
+        level = half.planar & ~steep(scan, half.normals)
         near = half.reach_m < const.STANDING_REACH_M
         stands = near & ~level & off_walls(half.points, walls, 2 * const.WALL_M) & (half.points @ scan.up[2] > ground_m)
         points = half.points[stands]

@@ -268,16 +268,15 @@ class PreparedScan:
     @cached_property
     def surfaces(self) -> tuple[Surfaces, Surfaces]:
         """Planes through the points of every second band of elevations, and through those between."""
-        poses = self._lidars_T_body[self.owner]
-        seen = np.einsum("nij,nj->ni", poses[:, :3, :3], self.points) + poses[:, :3, 3]
-        elevation = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
+        elevation = np.degrees(np.arcsin(self.rays[:, 2]))
         odd = (np.floor(elevation / const.SIGHT_DEG) % 2).astype(bool)
         return Surfaces.of(self.points[~odd]), Surfaces.of(self.points[odd])
 
     @cached_property
     def rays(self) -> Array:
-        """(M, 3) unit vectors to the points of a single scan, LiDAR frame."""
-        seen = transform(self._lidars_T_body[0], self.points)
+        """(M, 3) unit vectors to its points, in the frame of the LiDAR that saw each."""
+        poses = self._lidars_T_body[self.owner]
+        seen = np.einsum("nij,nj->ni", poses[:, :3, :3], self.points) + poses[:, :3, 3]
         return np.asarray(seen / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-9))
 
     @cached_property
@@ -328,8 +327,7 @@ def same_rays(match: PreparedScan, query: PreparedScan) -> bool:
 
     Those of rings do. Those of a scanner whose pattern never comes again do not, and its points tell positions apart.
     """
-    turn = np.radians(const.SIGHT_DEG / 2)
-    turns = Rotation.from_rotvec([[0, 0, 0], [turn, 0, 0], [-turn, 0, 0], [0, turn, 0], [0, -turn, 0]]).as_matrix()
+    turns = Rotation.from_euler("xy", [[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], degrees=True).as_matrix()
     turned = (query.rays[evenly(len(query.rays), const.SAMPLE)] @ turns).reshape(-1, 3)
     here, *others = np.median(kernels.KdTree(match.rays).nearest(turned)[1].reshape(len(turns), -1), axis=1)
     return bool(here < const.NO_PATTERN**2 * np.mean(others))

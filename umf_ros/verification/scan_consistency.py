@@ -40,7 +40,7 @@ def compare_scans(match: PreparedScan, query: PreparedScan, pose: Array) -> dict
     sights = match.free_space.look_at(moved), query.free_space.look_at(back)
     distances = np.sqrt(squared), np.sqrt(squared_back)
     reaches = counterpart_reach(query.spacing, blur_m), counterpart_reach(match.spacing, blur_m)
-    stands = _upright(match, match.normals[index]), _upright(match, match.sample_normals)
+    stands = steep(match, match.normals[index]), steep(match, match.sample_normals)
     ways = []
     for sight, distance, reach, upright in zip(sights, distances, reaches, stands, strict=True):
         seen = sight != Sight.HIDDEN
@@ -63,7 +63,7 @@ def counterpart_reach(spacing: Array, blur_m: float) -> Array:
     return const.COUNTERPART_M + 2 * blur_m + const.COUNTERPART_SPACINGS * spacing
 
 
-def _upright(scan: PreparedScan, normals: Array) -> Mask:
+def steep(scan: PreparedScan, normals: Array) -> Mask:
     """(N,) whether surfaces of a scan with these normals (N, 3) are steeper than 45 deg; those without one are not."""
     return (2 * (normals @ scan.up[2]) ** 2 < 1.0) & (np.einsum("ij,ij->i", normals, normals) > 0.5)
 
@@ -118,7 +118,7 @@ def _differences(submap: PreparedScan, other: PreparedScan, other_T_submap: Arra
     for row in np.argsort(gaps.min(axis=1), kind="stable")[: const.SCANS_COMPARED]:
         if np.isfinite(gaps[row].min()):
             one, its = ((it.scans or (it,))[i] for it, i in ((submap, row), (other, gaps[row].argmin())))
-            points, spacing = one.sample[stands := _upright(one, one.sample_normals)], one.spacing[stands]
+            points, spacing = one.sample[stands := steep(one, one.sample_normals)], one.spacing[stands]
             moved = transform(other_T_submap, points)
             sight, squared = its.free_space.look_at(moved), its.tree.nearest(moved)[1]
             missing = squared >= counterpart_reach(spacing, common_blur(one, its)) ** 2
@@ -218,7 +218,7 @@ def beyond_walls(match: PreparedScan, query: PreparedScan, pose: Array) -> float
     shares = []
     for scan, other, at in ((query, match, pose), (match, query, invert(pose))):
         sight = other.free_space.look_at(transform(at, scan.sample))
-        seen = _upright(scan, scan.sample_normals) & (sight != Sight.HIDDEN)
+        seen = steep(scan, scan.sample_normals) & (sight != Sight.HIDDEN)
         off = off_walls(scan.sample, largest_walls(scan.sample[seen], scan.sample_normals[seen]))
         shares.append(_share(off, seen, np.nan))
     return float(np.fmin.reduce(shares))
@@ -226,7 +226,7 @@ def beyond_walls(match: PreparedScan, query: PreparedScan, pose: Array) -> float
 
 def upright_sample(scan: PreparedScan) -> tuple[Array, Array]:
     """Points (N, 3) of a scan's sample on surfaces steeper than 45 deg, and their normals (N, 3)."""
-    chosen = _upright(scan, scan.sample_normals)
+    chosen = steep(scan, scan.sample_normals)
     return scan.sample[chosen], scan.sample_normals[chosen]
 
 
@@ -258,7 +258,7 @@ def _mean_point_misfit(match: PreparedScan, query: PreparedScan, poses: Array) -
 
 def _point_misfit(scan: PreparedScan, other: PreparedScan, poses: Array) -> Array:
     """(K,) mean misfit with a scan of some of the other's standing points that are visible; NaN where few are."""
-    stands = np.flatnonzero(_upright(other, other.sample_normals))
+    stands = np.flatnonzero(steep(other, other.sample_normals))
     rows = stands[evenly(len(stands), const.SAMPLE // const.SCOUT_EVERY)]
     reach = counterpart_reach(other.spacing[rows], common_blur(scan, other))
     misfit: Array = scan.free_space.point_misfits(scan.tree, other.sample[rows], reach, poses, const.RIVAL_MISFIT)

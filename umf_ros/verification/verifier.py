@@ -191,7 +191,8 @@ class Verifier:
                 one.measurements |= self._commonplace(one)
         for one, found in passages:  # those at another heading are rivals
             rivals = [other.pose for other, _ in passages if other is not one and other.candidate is one.candidate]
-            one.measurements["lead"] = found.lead_over(rivals)
+            if rivals:
+                one.measurements["lead"] = found.lead_over(rivals)
         return judged
 
     def _promises(self, hypothesis: Hypothesis, least: float) -> bool:
