@@ -78,7 +78,7 @@ def test_the_citation_is_a_citation() -> None:
 
 
 def test_every_source_that_is_cited_is_listed() -> None:
-    text = "\n".join(path.read_text(encoding="utf-8") for path in [*PACKAGE.rglob("*.py"), *ROOT.glob("docs/*.md")])
+    text = "\n".join(path.read_text(encoding="utf-8") for path in [*PACKAGE.rglob("*.py"), *ROOT.glob("docs/**/*.md")])
     listed = set(re.findall(r"^- \*\*\[(.+?)\]\*\*", text_of("docs/references.md"), re.MULTILINE))
     cited = set(re.findall(r"\[([A-ZÀ-Ž][\w-]+ (?:19|20)\d\d)[\],]", text))
     assert "UMF" in listed and cited <= listed
