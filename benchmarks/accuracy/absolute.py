@@ -11,8 +11,6 @@ that are accepted at the end and wrong by more than five of their stated sigmas.
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
 import time
 from collections import Counter
@@ -27,6 +25,7 @@ from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.frames import State
 from umf_ros.core.geometry import Array, align, heading, transform
+from umf_ros.lab.program import parser_of, write_figures
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, AbsoluteWorld, open_ground
 from umf_ros.pose_graph.backend import PoseGraph
 
@@ -163,14 +162,12 @@ def measure(seed: int, quick: bool) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--seed", type=int, default=FIRST_SEED)
     parser.add_argument("--quick", action="store_true", help="0.5 km instead of 1.5 km")
-    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     figures = measure(arguments.seed, arguments.quick)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+    write_figures(arguments.json, figures)
 
 
 if __name__ == "__main__":
