@@ -47,6 +47,19 @@ def header(stamp_ns: int, frame_id: str = "sensor", store: Any = STORE) -> Any:
     return make("std_msgs/msg/Header", store, stamp=stamp, frame_id=frame_id, **sequence)
 
 
+def transform(parent: str, child: str, pose: Array) -> Any:
+    """A TransformStamped."""
+    x, y, z = map(float, pose[:3, 3])
+    turn = dict(zip("xyzw", map(float, to_quaternion(pose)), strict=True))
+    moved = make(
+        "geometry_msgs/msg/Transform",
+        translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+        rotation=make("geometry_msgs/msg/Quaternion", **turn),
+    )
+    kind = "geometry_msgs/msg/TransformStamped"
+    return make(kind, header=header(START_NS, parent), child_frame_id=child, transform=moved)
+
+
 def image(stamp_ns: int, pixels: np.ndarray, encoding: str = "mono8", store: Any = STORE, **changes: Any) -> Any:
     fields = {
         "header": header(stamp_ns, store=store),

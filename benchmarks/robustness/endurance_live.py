@@ -29,6 +29,7 @@ from live_nodes import (
     play,
 )
 from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile
 from rich.console import Console
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import String
@@ -39,8 +40,10 @@ from umf_ros.core.geometry import expmap
 from umf_ros.durable_graph import DurableGraph
 from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops, with_wrong_closures
+from umf_ros.nodes.conversions import CLOSURES_QOS
 from umf_ros.sensors.decode import OdometrySample
 
+Topics = dict[str, tuple[type, str, QoSProfile]]
 Pairs = set[tuple[int, int]]
 Rng = np.random.Generator
 FIRST_LOOP = 215
@@ -175,8 +178,12 @@ def fuzz_back_end(folder: Path, count: int, rng: Rng) -> Figures:
         }
         return sum(abs(sent[kind] - found[kind]) for kind in sent)
 
-    topics = {"odometry": (Odometry, "/odom"), "closures": (Odometry, "/loop_closures")}
-    return _fuzz(folder, BACK_END, topics | {"reject": (String, f"/{BACK_END}/reject_edge")}, missing, count, rng, None)
+    topics: Topics = {
+        "odometry": (Odometry, "/odom", MANY),
+        "closures": (Odometry, "/loop_closures", CLOSURES_QOS),
+        "reject": (String, f"/{BACK_END}/reject_edge", MANY),
+    }
+    return _fuzz(folder, BACK_END, topics, missing, count, rng, None)
 
 
 def fuzz_front_end(folder: Path, count: int, config: Path, rng: Rng) -> Figures:
@@ -192,14 +199,14 @@ def fuzz_front_end(folder: Path, count: int, config: Path, rng: Rng) -> Figures:
         fates = {name: ears.value(FRONT_END, "detector", f"{short}_received") for name, short in decoded.items()}
         return total + sum(max(0.0, abs(sent[name] - counted) - held) for name, counted in fates.items())
 
-    named = {name: (kind, getattr(topics, name)) for name, kind in kinds.items()}
+    named: Topics = {name: (kind, getattr(topics, name), MANY) for name, kind in kinds.items()}
     return _fuzz(folder, FRONT_END, named, missing, count, rng, config)
 
 
 def _fuzz(
     folder: Path,
     node_name: str,
-    topics: dict[str, tuple[type, str]],
+    topics: Topics,
     missing: Callable[[Ears, Counter[str]], float],
     count: int,
     rng: Rng,
@@ -207,7 +214,7 @@ def _fuzz(
 ) -> Figures:
     """Send odd messages of every kind in turn; `missing` says how many of them are not accounted for."""
     with listening() as ears:
-        publishers = {name: ears.create_publisher(kind, topic, MANY) for name, (kind, topic) in topics.items()}
+        publishers = {name: ears.create_publisher(*topic) for name, topic in topics.items()}
         node = NodeUnderTest(node_name, _fresh(folder, node_name), {}, config=config)
         crashes = int(not ears.anew(node_name))
         ears.until(lambda: all(publisher.get_subscription_count() for publisher in publishers.values()), 10.0)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from finished_runs import at, stamp, trajectory
 from scipy.spatial.transform import Rotation
 from support.judged import judge_closure
 
@@ -26,23 +27,12 @@ from umf_ros.runs.truth import (
     trajectory_error,
 )
 
-START_NS = 1_600_000_000 * 10**9
 RULES = Loop(min_time_gap_s=20, min_travel_m=15)
 
 
-def stamp(second: float) -> int:
-    return START_NS + round(second * 1e9)
-
-
-def at(second: float) -> Array:
-    """1 m/s along x for 40 s, then the same again: the rover was carried back."""
-    return make_pose(np.eye(3), [second % 40, 0.0, 0.0])
-
-
 def truth(first: int = 0, last: int = 80, has_orientation: bool = True) -> Trajectory:
-    seconds = np.arange(first, last)
-    stamps = np.array([stamp(second) for second in seconds], np.int64)
-    return Trajectory(stamps, np.stack([at(second) for second in seconds]), has_orientation)
+    known = trajectory(first, last)
+    return Trajectory(known.stamps_ns, known.poses, has_orientation)
 
 
 ROWS = [(stamp(second), 0, float(second)) for second in range(0, 80, 2)]
