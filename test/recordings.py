@@ -189,11 +189,13 @@ def write_mcap(
     path: Path,
     entries: Iterable[Entry],
     chunk_size: int = 50_000,
-    garble: Callable[[int, str], bool] = lambda number, topic: False,
+    change: Callable[[int, str, bytes], bytes] = lambda number, topic, data: data,
+    profile: str = "ros2",
+    **options: Any,
 ) -> Path:
     with path.open("wb") as file:
-        writer = McapWriter(file, chunk_size=chunk_size)
-        writer.start("ros2")
+        writer = McapWriter(file, chunk_size=chunk_size, **options)
+        writer.start(profile)
         channels: dict[str, int] = {}
         for i, (topic, log_ns, message) in enumerate(entries):
             if topic not in channels:
@@ -201,9 +203,7 @@ def write_mcap(
                 schema = writer.register_schema(message.__msgtype__, "ros2msg", text.encode())
                 channels[topic] = writer.register_channel(topic, "cdr", schema)
             data = bytes(STORE.serialize_cdr(message, message.__msgtype__))
-            if garble(i, topic):
-                data = data[: len(data) // 2]
-            writer.add_message(channels[topic], log_ns, data, log_ns)
+            writer.add_message(channels[topic], log_ns, change(i, topic, data), log_ns)
         writer.finish()
     return path
 

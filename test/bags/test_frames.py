@@ -145,7 +145,10 @@ def test_a_topic_of_another_type_is_refused(tmp_path: Path) -> None:
 
 
 def test_bytes_that_are_no_message_are_skipped_and_counted(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", ENTRIES, garble=lambda i, topic: topic == CLOUD and i % 3 == 0)
+    def halved(number: int, topic: str, data: bytes) -> bytes:
+        return data[: len(data) // 2] if topic == CLOUD and number % 3 == 0 else data
+
+    path = write_mcap(tmp_path / "a.mcap", ENTRIES, change=halved)
     told: list[str] = []
     reader = FrameReader(open_bag(path), small_settings(tmp_path), warn=told.append)
     frames = list(reader)
