@@ -24,10 +24,11 @@ from scipy.spatial.transform import Rotation
 from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.frames import State
-from umf_ros.core.geometry import Array, align, heading, transform
+from umf_ros.core.geometry import Array, heading
 from umf_ros.lab.program import parser_of, write_figures
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, AbsoluteWorld, open_ground
 from umf_ros.pose_graph.backend import PoseGraph
+from umf_ros.runs.truth import absolute_trajectory_error
 
 FIRST_SEED = 20_000
 # of odometry that is off by 1 to 2 % after 1.5 km, and a pose per second
@@ -90,7 +91,6 @@ class Drive:
         graph.settle()
         stamps, poses = graph.trajectory()
         truth = world.truth[stamps // PERIOD_NS][:, :3, 3]
-        moved = transform(align(poses[:, :3, 3], truth)[0], poses[:, :3, 3])
         believed = {(one.source, one.stamp_ns) for one in graph.reference.verdicts() if one.state is State.ACCEPTED}
         lies = [
             (one.source, one.stamp_ns)
@@ -100,7 +100,7 @@ class Drive:
         reasons = Counter(
             f"{v.source.value}: {v.reason}" for v in graph.reference.verdicts() if v.state is not State.ACCEPTED
         )
-        error = float(np.sqrt(np.square(moved - truth).sum(axis=1).mean()))
+        error = absolute_trajectory_error(poses[:, :3, 3], truth)
         return error, sum(lie in believed for lie in lies), graph.reference.report(), reasons
 
 

@@ -44,7 +44,6 @@ def test_take_reads_the_named_cells():
 
 
 def test_windows_are_put_back_where_they_came_from():
-    torch.manual_seed(0)
     head = ImageLocal(TINY).eval()
     plain = torch.zeros(1, 16, 16, 24)
     marked = plain.clone()
@@ -54,13 +53,11 @@ def test_windows_are_put_back_where_they_came_from():
 
 
 def test_saliency_is_a_share_of_the_attention():
-    torch.manual_seed(0)
     found = ImageLocal(TINY).eval()(torch.randn(2, 16, 16, 24))
     torch.testing.assert_close(found.saliency.mean(1), torch.ones(2), atol=1e-4, rtol=0)
 
 
 def test_templates_share_out_the_features_that_exist():
-    torch.manual_seed(0)
     lit = IterativeAttention(inputs=8, count=4, outputs=6, iterations=3)
     mask = torch.tensor([[True] * 7 + [False] * 3])
     tokens = torch.randn(1, 10, 8)

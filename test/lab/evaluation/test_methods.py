@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import typer
 from landmarks import CONFUSED, PLACES, LandmarkEmbedder, LineWorld
 from recordings import small_settings, traverse, write_mcap
-from tiny_worlds import TINY, world_arrays
+from tiny_worlds import world_arrays
 from typer.testing import CliRunner
 
 from umf_ros.bags.frames import FrameReader
@@ -26,8 +25,6 @@ from umf_ros.lab.evaluation.methods import FIGURES, bootstrap
 from umf_ros.lab.evaluation.methods_run import MethodsRun, compare_methods, make_others, search_ms
 from umf_ros.lab.evaluation.results import CAPTIONS
 from umf_ros.lab.evaluation.worlds import FIRST
-from umf_ros.lab.training.networks import save_weights
-from umf_ros.networks.umf import UMF
 
 PUBLISHED = "recall1 recall1_low recall1_high recall5 top1percent auc_pr recall_at_precision1 parameters"
 PUBLISHED += " extract_ms match_ms bytes"
@@ -40,13 +37,6 @@ class DrivenLine(LineWorld):
 
     def driven(self, wanted: tuple[int, ...]):  # type: ignore[no-untyped-def]
         return (visit for visit in self if visit.pass_index in wanted)
-
-
-@pytest.fixture
-def weights(tmp_path: Path) -> Path:
-    torch.manual_seed(0)
-    save_weights(UMF(TINY), tmp_path / "tiny.safetensors", {})
-    return tmp_path / "tiny.safetensors"
 
 
 def test_the_interval_holds_the_mean_and_narrows_with_queries() -> None:

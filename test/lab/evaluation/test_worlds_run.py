@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import pytest
-import torch
 from landmarks import CONFUSED, PLACES, LandmarkEmbedder, LineWorld
 from tiny_worlds import TINY
 
@@ -15,7 +14,6 @@ from umf_ros.core.config import Verification
 from umf_ros.lab.evaluation import worlds as worlds_run
 from umf_ros.lab.evaluation.summary import WorldResult, cost_of_weights
 from umf_ros.lab.evaluation.worlds import WorldEvaluation, evaluate_worlds
-from umf_ros.lab.training.networks import save_weights
 from umf_ros.networks.umf import UMF
 
 
@@ -49,14 +47,6 @@ def test_the_opposite_direction_is_reported_apart(result: WorldResult) -> None:
     bins = {item.name: item for item in result.yaw}
     assert bins["10-20 deg"].queries == PLACES and bins["opposite direction"].queries == PLACES
     assert bins["opposite direction"].recall1 == pytest.approx(1 - len(CONFUSED) / PLACES)
-
-
-@pytest.fixture
-def weights(tmp_path: Path) -> Path:
-    torch.manual_seed(0)
-    path = tmp_path / "tiny.safetensors"
-    save_weights(UMF(TINY), path, {})
-    return path
 
 
 def test_tables_figures_and_pictures_of_a_small_network(
