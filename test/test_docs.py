@@ -64,10 +64,8 @@ def test_what_pre_commit_runs_is_what_lint_runs() -> None:
 
 
 def test_the_changelog_has_the_version() -> None:
-    version = re.search(r"<version>(.+)</version>", text_of("package.xml"))
-    assert version and re.search(
-        rf"^{re.escape(version[1])} \(\d{{4}}-\d\d-\d\d\)\n-+$", text_of("CHANGELOG.rst"), re.M
-    )
+    (version,) = re.findall(r"<version>(.+)</version>", text_of("package.xml"))
+    assert re.search(rf"^{re.escape(version)} \(\d{{4}}-\d\d-\d\d\)\n-+$", text_of("CHANGELOG.rst"), re.M)
 
 
 def test_the_citation_is_a_citation() -> None:
@@ -78,7 +76,7 @@ def test_the_citation_is_a_citation() -> None:
 
 
 def test_every_source_that_is_cited_is_listed() -> None:
-    text = "\n".join(path.read_text(encoding="utf-8") for path in [*PACKAGE.rglob("*.py"), *ROOT.glob("docs/*.md")])
+    text = "\n".join(path.read_text(encoding="utf-8") for path in [*PACKAGE.rglob("*.py"), *ROOT.glob("docs/**/*.md")])
     listed = set(re.findall(r"^- \*\*\[(.+?)\]\*\*", text_of("docs/references.md"), re.MULTILINE))
     cited = set(re.findall(r"\[([A-ZÀ-Ž][\w-]+ (?:19|20)\d\d)[\],]", text))
     assert "UMF" in listed and cited <= listed

@@ -55,5 +55,7 @@ def test_figures_of_this_checkout_are_those_of_its_files() -> None:
     left_out = [ROOT / "umf_ros" / name for name in ("lab", "baselines")]
     runtime = [path for path in (ROOT / "umf_ros").rglob("*.py") if not any(map(path.is_relative_to, left_out))]
     assert found["runtime: files"] == len(runtime)
+    read = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]  # not those in docs/history
+    assert found["docs: words"] == sum(len(path.read_text(encoding="utf-8").split()) for path in read)
     assert 500 < found["kernels: code lines of C++"] < found["runtime: code lines"]
     assert found["imports of the lab or the baselines by the runtime"] == 0

@@ -6,6 +6,7 @@ python tools/structure_figures.py --record          take lower figures into the 
 
 Code lines are those without blank lines, comments, docstrings and imports. The runtime is the package without `lab` and
 `baselines`. Imported files are all that a module imports, directly or not, the module itself and late imports included.
+Words of the documentation are those of the README and of `docs` without `docs/history`.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ LIMITS = {
     "lab: lines": 18_000,
     "benchmarks: lines": 4_000,
     "tests: lines": 32_000,
+    "docs: words": 20_000,
     "records for one pair of keyframes": 6,
     "largest complexity": 10,
     "imports of the lab or the baselines by the runtime": 0,
@@ -134,6 +136,7 @@ def figures(checkout: Checkout) -> dict[str, int]:
         "lab: lines": lines(checkout.within("lab")),
         "benchmarks: lines": lines(sorted((outside / "benchmarks").rglob("*.py"))),
         "tests: lines": lines(tests),
+        "docs: words": words(pages(outside)),
         "records for one pair of keyframes": checkout.records(),
         "largest complexity": checkout.complexity(),
         "imports of the lab or the baselines by the runtime": checkout.forbidden_imports(),
@@ -145,6 +148,16 @@ def figures(checkout: Checkout) -> dict[str, int]:
 def lines(paths: list[Path]) -> int:
     """Lines of files."""
     return sum(len(path.read_text(encoding="utf-8").splitlines()) for path in paths)
+
+
+def pages(root: Path) -> list[Path]:
+    """Pages that a user reads: the README and `docs` without `docs/history`."""
+    return [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+
+
+def words(paths: list[Path]) -> int:
+    """Words of files, as `wc -w` counts them."""
+    return sum(len(path.read_text(encoding="utf-8").split()) for path in paths)
 
 
 def code_lines(paths: list[Path]) -> int:
@@ -222,18 +235,18 @@ def above(found: dict[str, int], record: dict[str, int]) -> list[str]:
     return [f"{name}: {found[name]:,}, more than {most:,}" for name, most in record.items() if found[name] > most]
 
 
-def main(words: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Print the figures, check them against the record, or lower the record."""
-    folders = [Path(word) for word in words if not word.startswith("-")] or [Path(__file__).parents[1]]
+    folders = [Path(word) for word in arguments if not word.startswith("-")] or [Path(__file__).parents[1]]
     columns = [figures(Checkout(folder)) for folder in folders]
     found = columns[-1]
     record: dict[str, int] = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
-    if "--check" in words:
+    if "--check" in arguments:
         worse = above(found, record)
         for sentence in worse:
             sys.stdout.write(f"tools/structure_record.json: {sentence}\n")
         return bool(worse)
-    if "--record" in words:
+    if "--record" in arguments:
         lower = {name: min(found[name], record.get(name, found[name])) for name in LIMITS}
         RECORD.write_text(json.dumps(lower, indent=2) + "\n", encoding="utf-8")
     for name in found:

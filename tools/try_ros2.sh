@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Run every verb of the `ros2` command on nodes in two namespaces; print a table "tried | expected | got".
 #
-#   source install/setup.bash && src/umf_ros/tools/try_ros2.sh [--write docs/ros.md]
+#   source install/setup.bash && src/umf_ros/tools/try_ros2.sh [--write docs/history/ros.md]
 #
 # Needs a sourced Jazzy with umf_ros built by colcon; no sensors. --write puts the table between the markers of a file.
 set -u

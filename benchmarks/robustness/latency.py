@@ -1,6 +1,6 @@
 """Print latencies of the back-end at the end of a long drive, and its memory; with `--start`, those of a start.
 
-`python benchmarks/robustness/latency.py [--poses 20000] [--quick] [--start RECORDING] [--bag RECORDING] [--json FILE]`
+`python benchmarks/robustness/latency.py [--poses 20000] [--quick] [--start|--bag|--parked BAG] [--json FILE]`
 
 A node resumes a stored graph and receives the last 40 closures over DDS, with odometry at 20 Hz: its executor's longest
 stall, the time from a closure to its verdict, memory and time to shut down; started again, it settles and saves. CPU
@@ -10,6 +10,8 @@ metres, and of closures that come while the graph is still busy with all others.
 
 `--bag`: a recording of the simulator is played to front-end and back-end, and again with `map_node` and its listener:
 time from a scan to the closures of its keyframe, at this process, and the longest stall of each node's executor.
+`--parked`: its first images and scan arrive again and again at 5 Hz while the odometry stands still, and then nothing
+arrives: share of a core that the front-end takes.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from live_nodes import BACK_END, FRONT_END, Ears, Figures, NodeUnderTest, Rover, later, listening, own_domain, spread
@@ -31,6 +34,7 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
 from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
+from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import Settings, load_settings, topics_of
 from umf_ros.core.geometry import from_enu
 from umf_ros.core.io import memory_mb
@@ -38,7 +42,9 @@ from umf_ros.durable_graph import DurableGraph
 from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.live.live_graph import NODES, PLAYER, WHOLE, NodeProcess
 from umf_ros.lab.program import UMF, parser_of, write_figures
+from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, rover_loops
+from umf_ros.lab.simulation.simulator import START_NS
 from umf_ros.nodes.conversions import LATCHED_QOS, from_time, sensor_qos
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason, State
@@ -52,6 +58,7 @@ SPARSE: dict[str, object] = {"pose_graph.max_gap_s": 3.0}
 LATE = 40
 """Closures whose cost is measured."""
 FIX_EVERY_M = 4
+STANDING_S, ODOMETRY_HZ, SCANS_HZ = 40.0, 25, 5
 NAMES = {
     "live_stall_ms": "executor's longest stall, ms",
     "drive_event_cpu_ms_p50": "CPU per closure, ms, p50",
@@ -275,12 +282,60 @@ def with_and_without_map(bag: Path, folder: Path) -> Figures:
     return figures
 
 
+def write_parked(recording: Path, path: Path) -> None:
+    """Write half a minute of a rover that stands where a recording of the simulator begins."""
+    topics = topics_of(Settings(dataset="simulated"))
+    sensors = (topics.left_image, topics.right_image, topics.left_info, topics.right_info, topics.cloud)
+    first: dict[str, Any] = {}
+    for topic, _, message in open_bag(recording).messages((*sensors, topics.odometry)):
+        first.setdefault(topic, message)
+        if len(first) == len(sensors) + 1:
+            break
+    speed = first[topics.odometry].twist.twist
+    speed.linear = speed.angular = type(speed.linear)(0.0, 0.0, 0.0)
+    with BagWriter(path) as bag:
+        for number in range(round(STANDING_S * ODOMETRY_HZ)):
+            now_ns = START_NS + number * 10**9 // ODOMETRY_HZ
+            for topic in (topics.odometry, *(sensors if number % (ODOMETRY_HZ // SCANS_HZ) == 0 else ())):
+                header = first[topic].header
+                header.stamp.sec, header.stamp.nanosec = divmod(now_ns, 10**9)
+                bag.write(topic, first[topic], now_ns)
+
+
+def load_when_parked(recording: Path, folder: Path) -> Figures:
+    """Print what share of a core the front-end takes while the rover stands, and while nothing arrives."""
+    parked = folder / "parked.mcap"
+    write_parked(recording, parked)
+    given = [word for text in WHOLE for word in ("-p", text)]
+    node = NodeProcess(NODES[0], ["--ros-args", *given], folder, lambda _: None)
+    try:
+        node.wait_ready()
+        player = NodeProcess(PLAYER, [str(parked), "--wait-for-subscribers", "--quiet"], folder, lambda _: None)
+        time.sleep(STANDING_S / 2)  # connections, and the first keyframe
+        figures: Figures = {"parked": load_of(node)}
+        print(f"parked, scans and images at {SCANS_HZ} Hz: {figures['parked']:6.1%} of a core")
+        player.stop()
+        figures["nothing_arrives"] = load_of(node)
+        print(f"nothing arrives:                   {figures['nothing_arrives']:6.1%} of a core")
+    finally:
+        node.stop()
+    return figures
+
+
+def load_of(node: NodeProcess) -> float:
+    """Return the share of a core that a node takes for some seconds."""
+    before_s = node.cpu_s
+    time.sleep(STANDING_S / 4)
+    return (node.cpu_s - before_s) / (STANDING_S / 4)
+
+
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--poses", type=int, default=20_000, help="of the drive, one metre apart")
     parser.add_argument("--quick", action="store_true", help="2,000 poses")
     parser.add_argument("--start", type=Path, help="a recording: time the start of its replay instead")
     parser.add_argument("--bag", type=Path, help="recording of the simulator: closures with and without map_node")
+    parser.add_argument("--parked", type=Path, help="recording of the simulator: load of the front-end while parked")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if arguments.start is not None:
@@ -289,6 +344,9 @@ def main() -> None:
         elif arguments.bag is not None:
             with own_domain():
                 figures = with_and_without_map(arguments.bag, Path(folder))
+        elif arguments.parked is not None:
+            with own_domain():
+                figures = load_when_parked(arguments.parked, Path(folder))
         else:
             poses = 2_000 if arguments.quick else arguments.poses
             figures = one_by_one(poses) | live(poses, Path(folder)) | saved(Path(folder)) | all_at_once(poses)

@@ -18,6 +18,7 @@ import typer
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.reader import Bag
 from umf_ros.core.config import Settings
+from umf_ros.core.io import write_atomically
 from umf_ros.core.trajectory import Trajectory
 from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.replay import Replay
@@ -32,10 +33,8 @@ class Ended(NamedTuple):
     """A command that has ended.
 
     Attributes:
-        status: exit status; negative: the signal that ended it.
-        output: on both streams.
-        wall_s, cpu_s: time that it took, and processor time, its children included.
-        memory_mb: peak of its resident memory.
+        status, output: exit status, negative: the signal that ended it; what came on both streams.
+        wall_s, cpu_s, memory_mb: time and processor time that it took, its children included; peak of resident memory.
     """
 
     status: int
@@ -56,11 +55,10 @@ def run(command: Sequence[str], folder: Path | None = None, limit: Callable[[], 
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as output:
         process = subprocess.Popen(command, cwd=folder, stdout=output, stderr=subprocess.STDOUT, preexec_fn=limit)
         _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        wall_s = time.monotonic() - started_s
+        wall_s, process.returncode = time.monotonic() - started_s, os.waitstatus_to_exitcode(status)
         output.seek(0)
-        text = output.read()
-    return Ended(process.returncode, text, wall_s, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+        cpu_s = used.ru_utime + used.ru_stime
+        return Ended(process.returncode, output.read(), wall_s, cpu_s, used.ru_maxrss / 1024)
 
 
 def umf(*arguments: str | Path, folder: Path | None = None, right: tuple[int, ...] = (0,)) -> Ended:
@@ -111,4 +109,4 @@ def parser_of(text: str | None) -> ArgumentParser:
 def write_figures(path: Path | None, figures: Any) -> None:
     """Write figures as JSON, unless there is no file for them."""
     if path is not None:
-        path.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        write_atomically(path, json.dumps(figures, indent=2) + "\n")

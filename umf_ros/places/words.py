@@ -19,7 +19,7 @@ FITTED_ON = 40
 ROUNDS = 15
 """Rounds of k-means (*by hand*: the assignments no longer change recall after ten)."""
 SCAN_SHARE = 0.46
-"""Worth of the words of scans, as a share of that of images (*fitted*: weights 0.25 and 0.54; training.md)."""
+"""Worth of the words of scans, as a share of that of images (*fitted*: 0.25 and 0.54; docs/history/training.md)."""
 SERIAL_ROWS = 32
 """Local vectors per product: OpenBLAS computes such a product on one thread, always in the same order."""
 SEED = 0

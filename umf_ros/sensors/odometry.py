@@ -58,9 +58,9 @@ class OdometryDecoder:
         """Return a pose (4, 4) with the parts that are the first ones so far integrated."""
         elapsed_s = (stamp - self._last_ns) * 1e-9
         is_moving = 0 < elapsed_s <= LONGEST_STEP_S and (np.linalg.norm(speeds, axis=1) > REST).any()
-        steps = speeds * (elapsed_s if is_moving else 0.0)
-        half = expmap(np.hstack([steps[1], steps[0]])[None] / 2)[0]
-        self._integrated = self._integrated @ half @ half
+        if is_moving:
+            half = expmap(np.hstack([speeds[1], speeds[0]])[None] * elapsed_s / 2)[0]
+            self._integrated = self._integrated @ half @ half
         if self._is_filled[1]:
             self._integrated[:3, :3] = odom_T_body[:3, :3]
         net = relative(self._start, self._integrated)

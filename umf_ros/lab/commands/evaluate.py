@@ -266,12 +266,9 @@ def command(
         chosen, files = (dataset, embedder, None if every else weights), (odometry, odometry_frame, ground_truth)
         opened = open_with_truth(data, parameters(config, changes), chosen, files)
         figures = every.recording(opened) if every else _on_recording(opened, out)
-    if json_file is not None:
-        import json
+    from umf_ros.lab.program import write_figures
 
-        from umf_ros.core.io import write_atomically
-
-        write_atomically(json_file, json.dumps(figures, indent=2) + "\n")
+    write_figures(json_file, figures)
 
 
 def lists_place_sets(listing: Path) -> bool:

@@ -59,6 +59,12 @@ class NodeProcess:
         """Exit status, or None while it runs."""
         return self._process.poll()
 
+    @property
+    def cpu_s(self) -> float:
+        """CPU time that the running process has taken, s; Linux."""
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
     def wait_ready(self) -> None:
         """Wait until the node says it is ready, or waits for topics.
 
