@@ -6,8 +6,8 @@ from pathlib import Path
 
 import psycopg
 from conftest import make_keyframe
-from support.postgres import PASSWORD, PostgresServer
 
+from benchmarks.accuracy.postgres import PASSWORD, PostgresServer
 from umf_ros.core.config import Database
 from umf_ros.core.frames import Keyframe
 from umf_ros.places.database import PlaceDatabase

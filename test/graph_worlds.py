@@ -115,18 +115,27 @@ def right(world: GraphWorld) -> set[tuple[int, int]]:
     return {(c.first, c.second) for c in world.closures if c.right}
 
 
-def batch_optimum(world: GraphWorld) -> Array:
-    """Levenberg-Marquardt over every pose, right closures only."""
+def whole_graph(
+    world: GraphWorld, poses: Array, fixed: Array | None = None
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Every pose, its odometry and the right closures, with the first pose fixed where one is given."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(world.odometry[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    if fixed is not None:
+        graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(fixed), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
     steps = invert(world.odometry[:-1]) @ world.odometry[1:]
-    for k, pose in enumerate(world.truth):
+    for k, pose in enumerate(poses):
         values.insert(k, gtsam.Pose3(pose))
         if k:
             graph.add(between(k - 1, k, steps[k - 1], world.step_covariances[k]))
     for c in world.closures:
         if c.right:
             graph.add(between(c.first, c.second, c.pose, c.covariance))
+    return graph, values
+
+
+def batch_optimum(world: GraphWorld) -> Array:
+    """Levenberg-Marquardt over every pose, right closures only."""
+    graph, values = whole_graph(world, world.truth, world.odometry[0])
     for _ in range(3):
         values = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
     return np.stack([values.atPose3(k).matrix() for k in range(len(world.truth))])

@@ -47,6 +47,19 @@ def header(stamp_ns: int, frame_id: str = "sensor", store: Any = STORE) -> Any:
     return make("std_msgs/msg/Header", store, stamp=stamp, frame_id=frame_id, **sequence)
 
 
+def transform(parent: str, child: str, pose: Array) -> Any:
+    """A TransformStamped."""
+    x, y, z = map(float, pose[:3, 3])
+    turn = dict(zip("xyzw", map(float, to_quaternion(pose)), strict=True))
+    moved = make(
+        "geometry_msgs/msg/Transform",
+        translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+        rotation=make("geometry_msgs/msg/Quaternion", **turn),
+    )
+    kind = "geometry_msgs/msg/TransformStamped"
+    return make(kind, header=header(START_NS, parent), child_frame_id=child, transform=moved)
+
+
 def image(stamp_ns: int, pixels: np.ndarray, encoding: str = "mono8", store: Any = STORE, **changes: Any) -> Any:
     fields = {
         "header": header(stamp_ns, store=store),
@@ -176,11 +189,13 @@ def write_mcap(
     path: Path,
     entries: Iterable[Entry],
     chunk_size: int = 50_000,
-    garble: Callable[[int, str], bool] = lambda number, topic: False,
+    change: Callable[[int, str, bytes], bytes] = lambda number, topic, data: data,
+    profile: str = "ros2",
+    **options: Any,
 ) -> Path:
     with path.open("wb") as file:
-        writer = McapWriter(file, chunk_size=chunk_size)
-        writer.start("ros2")
+        writer = McapWriter(file, chunk_size=chunk_size, **options)
+        writer.start(profile)
         channels: dict[str, int] = {}
         for i, (topic, log_ns, message) in enumerate(entries):
             if topic not in channels:
@@ -188,9 +203,7 @@ def write_mcap(
                 schema = writer.register_schema(message.__msgtype__, "ros2msg", text.encode())
                 channels[topic] = writer.register_channel(topic, "cdr", schema)
             data = bytes(STORE.serialize_cdr(message, message.__msgtype__))
-            if garble(i, topic):
-                data = data[: len(data) // 2]
-            writer.add_message(channels[topic], log_ns, data, log_ns)
+            writer.add_message(channels[topic], log_ns, change(i, topic, data), log_ns)
         writer.finish()
     return path
 

@@ -56,6 +56,11 @@ def pose_at(x: float, y: float, yaw_deg: float = 0.0) -> np.ndarray:
     return make_pose([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]], [x, y, 0])
 
 
+def poses(*places: tuple[float, float, float]) -> np.ndarray:
+    """Poses at x, y in metres and a heading in degrees."""
+    return np.stack([pose_at(*place) for place in places])
+
+
 def world_arrays(count: int = 12, seed: int = 3) -> dict[str, np.ndarray]:
     """A shard: two passes along a line in 8 m steps, the second 2 m to the side with the same images and scans."""
     rng = np.random.default_rng(seed)

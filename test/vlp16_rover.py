@@ -8,13 +8,14 @@ from itertools import takewhile
 import numpy as np
 import rclpy
 from foreign_messages import VELODYNE
+from live_peers import odometry
 from nav_msgs.msg import Odometry
 from processes import Process, wait_until
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 
 from umf_ros.core.geometry import make_pose
-from umf_ros.nodes.conversions import to_pose, to_time
+from umf_ros.nodes.conversions import to_time
 
 SIZE = 128, 96
 CALIBRATION = """
@@ -58,16 +59,14 @@ class Vlp16Rover(Node):
     ) -> None:
         """Scans of sixteen rings, images and odometry at 5 Hz, driving ahead at 1 m/s; in real time with .2 s."""
         for step in takewhile(lambda _: not is_over(), range(int(5 * seconds))):
-            stamp = to_time(start_s * 10**9 + step * 200_000_000)
-            odometry = Odometry(child_frame_id="base_link")
-            odometry.header.frame_id, odometry.header.stamp = "odom", stamp
-            odometry.pose.pose = to_pose(make_pose(np.eye(3), [0.2 * step, 0.0, 0.0]))
+            stamp_ns = start_s * 10**9 + step * 200_000_000
+            stamp = to_time(stamp_ns)
             image = Image(height=SIZE[1], width=SIZE[0], step=SIZE[0], encoding="mono8")
             image.header.stamp, image.header.frame_id = stamp, "camera_optical"
             image.data = self._rng.integers(0, 255, SIZE[0] * SIZE[1], np.uint8).tobytes()
             info = CameraInfo(header=image.header, width=SIZE[0], height=SIZE[1], d=[0.0] * 5)
             info.k = np.array([100.0, 0, 64.0, 0, 100.0, 48.0, 0, 0, 1.0])
-            self.odometry.publish(odometry)
+            self.odometry.publish(odometry(stamp_ns, make_pose(np.eye(3), [0.2 * step, 0.0, 0.0])))
             for publisher in self.infos:
                 publisher.publish(info)
             self.clouds.publish(self._scan(stamp))

@@ -11,8 +11,6 @@ that are accepted at the end and wrong by more than five of their stated sigmas.
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
 import time
 from collections import Counter
@@ -26,9 +24,11 @@ from scipy.spatial.transform import Rotation
 from umf_ros.absolute.measurement import AbsoluteMeasurement, Aid
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.frames import State
-from umf_ros.core.geometry import Array, align, heading, transform
+from umf_ros.core.geometry import Array, heading
+from umf_ros.lab.program import parser_of, write_figures
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, AbsoluteWorld, open_ground
 from umf_ros.pose_graph.backend import PoseGraph
+from umf_ros.runs.truth import absolute_trajectory_error
 
 FIRST_SEED = 20_000
 # of odometry that is off by 1 to 2 % after 1.5 km, and a pose per second
@@ -91,7 +91,6 @@ class Drive:
         graph.settle()
         stamps, poses = graph.trajectory()
         truth = world.truth[stamps // PERIOD_NS][:, :3, 3]
-        moved = transform(align(poses[:, :3, 3], truth)[0], poses[:, :3, 3])
         believed = {(one.source, one.stamp_ns) for one in graph.reference.verdicts() if one.state is State.ACCEPTED}
         lies = [
             (one.source, one.stamp_ns)
@@ -101,7 +100,7 @@ class Drive:
         reasons = Counter(
             f"{v.source.value}: {v.reason}" for v in graph.reference.verdicts() if v.state is not State.ACCEPTED
         )
-        error = float(np.sqrt(np.square(moved - truth).sum(axis=1).mean()))
+        error = absolute_trajectory_error(poses[:, :3, 3], truth)
         return error, sum(lie in believed for lie in lies), graph.reference.report(), reasons
 
 
@@ -163,14 +162,12 @@ def measure(seed: int, quick: bool) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--seed", type=int, default=FIRST_SEED)
     parser.add_argument("--quick", action="store_true", help="0.5 km instead of 1.5 km")
-    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     figures = measure(arguments.seed, arguments.quick)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+    write_figures(arguments.json, figures)
 
 
 if __name__ == "__main__":

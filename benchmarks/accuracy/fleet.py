@@ -18,11 +18,9 @@ Prints and writes:
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
-import sys
 import tempfile
 import threading
 import time
@@ -38,6 +36,7 @@ import numpy as np
 import psycopg
 from pgvector import HalfVector
 from pgvector.psycopg import register_vector
+from postgres import PASSWORD, CuttableLink, PostgresServer
 from sessions import QUICK, Size, mapped, simulated, truth_of
 
 from umf_ros.core.config import Database, Settings
@@ -46,14 +45,12 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.fleet.inter_robot_closures import InterRobotClosure, InterRobotMatcher
 from umf_ros.fleet.server import FleetServer, add_rover, migrate
 from umf_ros.lab.evaluation.places_bench import bare_keyframe, made_up_drives
+from umf_ros.lab.program import parser_of, write_figures
 from umf_ros.maps.map_folder import MapFolder
 from umf_ros.maps.mapping import open_places
 from umf_ros.places.store import KeyframeStore, stored_identity
 from umf_ros.runs.truth import judge_closures
 from umf_ros.submaps.history import SubmapHistory
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "test"))
-from support.postgres import PASSWORD, CuttableLink, PostgresServer
 
 ROVERS = 4
 CUTS, KILLS = 20, 5
@@ -278,8 +275,7 @@ def measure(folder: MapFolder, places: int, seed: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser = parser_of(__doc__)
     parser.add_argument("--map", type=Path, help="map with its recordings; default: four simulated drives")
     parser.add_argument("--seed", type=int, default=10001, help="seed of the worlds and of all random draws")
     parser.add_argument("--work", type=Path, default=Path("data/fleet"), help="folder of the simulated drives")
@@ -294,10 +290,8 @@ def main() -> None:
     else:
         folder = MapFolder.open(given.map)
     figures = measure(folder, 10_000 if given.quick else 100_000, given.seed)
-    text = json.dumps(figures, indent=2) + "\n"
-    print(text, end="")
-    if given.json is not None:
-        given.json.write_text(text, encoding="utf-8")
+    print(json.dumps(figures, indent=2))
+    write_figures(given.json, figures)
 
 
 if __name__ == "__main__":

@@ -18,8 +18,6 @@ known up to 25 m beside it: peak of the grid, the published grid and all files, 
 
 from __future__ import annotations
 
-import argparse
-import json
 import multiprocessing
 import resource
 import tempfile
@@ -34,6 +32,7 @@ import open3d as o3d
 from umf_ros.core.config import TerrainSettings
 from umf_ros.core.frames import Points
 from umf_ros.core.geometry import Array, expmap, make_pose, transform
+from umf_ros.lab.program import parser_of, write_figures
 from umf_ros.lab.simulation.lidar import Lidar, pulse_directions
 from umf_ros.lab.simulation.presets import find_preset
 from umf_ros.lab.simulation.simulator import START_NS, Simulator
@@ -220,17 +219,15 @@ def diagonal(length_m: float) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--seed", type=int, default=FIRST_SEED)
     parser.add_argument("--noise", action="store_true")
     parser.add_argument("--diagonal", type=float, metavar="M")
-    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     figures = diagonal(arguments.diagonal) if arguments.diagonal else measure(arguments.seed, arguments.noise)
     for name, value in figures.items():
         print(f"{name:18s} {value if isinstance(value, str) else f'{value:.4g}'}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+    write_figures(arguments.json, figures)
 
 
 if __name__ == "__main__":

@@ -12,9 +12,6 @@ from __future__ import annotations
 
 import heapq
 import json
-import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from umf_ros.core.geometry import Array, interpolate, make_pose
 from umf_ros.core.resources import find
+from umf_ros.lab.program import JsonFile, umf, write_figures
 from umf_ros.lab.simulation.bag_writer import BagWriter, cloud_message, odometry_message, pose_message
 from umf_ros.lab.simulation.camera import cast
 from umf_ros.lab.simulation.domains.scanners import spinning
@@ -100,22 +98,18 @@ def _poses(simulator: Simulator) -> Iterator[Event]:
 
 def replay(bag: Path, config: Path | None, odometry: str, out: Path) -> dict[str, Any]:
     """Return the figures of one replay."""
-    words = ["replay", str(bag), "--out", str(out), *(["--config", str(config)] if config else [])]
-    words += ["--odometry", odometry] if odometry else []
-    process = subprocess.Popen([sys.executable, "-m", "umf_ros.cli", *words], stdout=subprocess.DEVNULL)
-    _, status, used = os.wait4(process.pid, 0)
-    if os.waitstatus_to_exitcode(status) not in (0, 3):
-        raise typer.Exit(1)
+    words = [*(["--config", str(config)] if config else []), *(["--odometry", odometry] if odometry else [])]
+    ended = umf("replay", bag, "--out", out, *words, right=(0, 3))
     judged = json.loads((out / "latest" / "summary.json").read_text(encoding="utf-8"))["ground_truth"]
     names = ("closures_true", "closures_false", "ate_odometry_m", "ate_optimized_m")
-    return {name: judged[name] for name in names} | {"cpu_s": used.ru_utime + used.ru_stime}
+    return {name: judged[name] for name in names} | {"cpu_s": ended.cpu_s}
 
 
 def main(
     seeds: list[int],
     rings: Annotated[list[int], typer.Option()] = [64, 16],  # noqa: B006
     narrow: bool = False,
-    json_file: Annotated[Path | None, typer.Option("--json")] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Simulate the drives, replay each with both odometries, and print the table."""
     table, rows = Table("drive", "odometry", "true", "false", "ATE", "optimised", "CPU s"), []
@@ -125,15 +119,13 @@ def main(
                 bag = Path(folder) / "drive.mcap"
                 config = write_drive(seed, kind, bag) if kind else None
                 if not kind:
-                    command = [sys.executable, "-m", "umf_ros.cli", "simulate", "--seed", str(seed), str(bag)]
-                    subprocess.run(command, check=True)
+                    umf("simulate", "--seed", str(seed), bag)
                 for name, choice in (("rover", ""), ("scans", "vgicp")):
                     found = replay(bag, config, choice, Path(folder) / name)
                     rows.append({"seed": seed, "rings": kind, "odometry": name} | found)
                     table.add_row(f"{seed}, {kind or 'narrow'}", name, *(f"{value:.4g}" for value in found.values()))
     Console().print(table)
-    if json_file:
-        json_file.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    write_figures(json_file, rows)
 
 
 if __name__ == "__main__":

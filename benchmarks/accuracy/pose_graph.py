@@ -22,10 +22,9 @@ messages. Each runs without wrong closures and with as many groups of near ones.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import time
+from argparse import Namespace
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
@@ -41,6 +40,7 @@ from umf_ros.core.geometry import Array, adjoint, expmap, invert, logmap, propag
 from umf_ros.core.trajectory import interpolated
 from umf_ros.lab.datasets.g2o import read_g2o
 from umf_ros.lab.datasets.graph_recording import PERIOD_NS, as_recording
+from umf_ros.lab.program import parser_of, write_figures
 from umf_ros.lab.simulation.pose_graphs import (
     WORLDS,
     GraphWorld,
@@ -473,23 +473,21 @@ def drive_short(world: GraphWorld, sure: float, jump_m: float, seed: int) -> lis
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("files", nargs="*", type=Path, help="further g2o files")
     parser.add_argument("--quick", action="store_true", help="fewer and smaller graphs")
     parser.add_argument("--short", type=int, metavar="N", help="N drives of one short revisit instead")
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help="seed of the first generated graph")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="worlds in parallel")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
     arguments = parser.parse_args()
     figures = short(arguments.seed, arguments.short) if arguments.short else run(arguments)
     print()
     for name, value in figures.items():
         print(f"{name:32s} {value:.4g}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+    write_figures(arguments.json, figures)
 
 
-def run(arguments: argparse.Namespace) -> dict[str, float]:
+def run(arguments: Namespace) -> dict[str, float]:
     """All figures but those of short drives."""
     # the cost first, while no other world is driven
     costs = cost(arguments.seed)

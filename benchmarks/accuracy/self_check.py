@@ -22,19 +22,17 @@ from typing import Any
 import numpy as np
 import typer
 
-from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import expmap, invert, relative
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.detector import LoopDetector, make_detector_embedder
+from umf_ros.lab.program import replay
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.presets import DEMO
 from umf_ros.lab.simulation.simulator import Simulator, record
-from umf_ros.replay import Replay
 from umf_ros.runs.run_file import NAME, RunFile, closure_row, read_odometry_of
 from umf_ros.runs.self_check import check_run
 from umf_ros.runs.truth import judge_closures
@@ -53,11 +51,7 @@ def run_of(work: Path, seed: int) -> Path:
     if not (run / "summary.json").exists():
         run.mkdir(exist_ok=True)
         bag = open_bag(recording)
-        settings = settings_for(bag, None, "auto")
-        replay = Replay(run, settings, LoopDetector(settings, make_detector_embedder(settings)))
-        for _ in replay.run(FrameReader(bag, settings).stream()):
-            pass
-        replay.finish({})
+        replay(bag, settings_for(bag, None, "auto"), run)
     return run
 
 

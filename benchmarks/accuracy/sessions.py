@@ -34,11 +34,8 @@ Prints and writes, over all worlds:
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -57,6 +54,7 @@ from umf_ros.core.frames import Frame
 from umf_ros.core.geometry import Array, align, cubes, evenly, heading, make_pose, relative, rotation_angle, transform
 from umf_ros.core.trajectory import Trajectory, write_tum
 from umf_ros.detector import LoopDetector, make_detector_embedder
+from umf_ros.lab.program import parser_of, replay, umf, write_figures
 from umf_ros.lab.scan_files import read_points
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.families import FAMILIES
@@ -71,7 +69,6 @@ from umf_ros.maps.joint_graph import JointMap, solve
 from umf_ros.maps.map_folder import MapFolder, MapSession
 from umf_ros.maps.mapping import Opening, add_session, grow, match_session, replay_session, unmatched
 from umf_ros.maps.outputs import write_results
-from umf_ros.replay import Replay
 from umf_ros.runs.reader import read_run
 from umf_ros.runs.truth import PLACE_ANGLE_DEG, PLACE_RADIUS_M, absolute_trajectory_error, judge_closures
 from umf_ros.runs.writer import with_places
@@ -328,8 +325,7 @@ def in_cloud(folder: MapFolder, joint: JointMap, truths: dict[str, Trajectory], 
         poses = np.concatenate([one.poses @ body_T_mast for one in joint.sessions])
         path = folder.path.with_name("poses.tum")
         write_tum(path, Trajectory(np.arange(len(poses)) * 10**9, poses))
-        command = ["map", "import-cloud", folder.path / "map.ply", "--trajectory", path, "--fov", "70", "--out", out]
-        subprocess.run([sys.executable, "-m", "umf_ros.cli", *map(str, command)], check=True)
+        umf("map", "import-cloud", folder.path / "map.ply", "--trajectory", path, "--fov", "70", "--out", out)
     for visitor, turn_rad in zip(visitors, (0.0, np.pi), strict=True):
         starts = cold_starts(MapFolder.open(out), joint, truths, visitor, CLOUD_STARTS, turn_rad)
         ends = [wake(starts, row) for row in starts.rows]
@@ -404,10 +400,7 @@ def localised(recording: Path, map_folder: Path, run: Path, update: bool) -> Pat
     chosen = {"mode": "localization", "map": str(map_folder), "localization__update": update}
     settings = settings_for(bag, None, "auto", **chosen)
     stored = with_places(settings, run) if update else settings
-    replay = Replay(run, settings, LoopDetector(stored, make_detector_embedder(settings)))
-    for _ in replay.run(FrameReader(bag, settings).stream()):
-        pass
-    replay.finish({})
+    replay(bag, settings, run, stored=stored)
     return run
 
 
@@ -434,14 +427,13 @@ def median(values: Any) -> float | None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--quick", action="store_true", help="three sessions of 40 s, four cold starts")
     parser.add_argument("--both-ways", action="store_true", help="sessions in both directions, cold starts against it")
     parser.add_argument("--what", choices=("", "initial", "cloud", "grow"), default="", help="other figures")
     parser.add_argument("--lidar-only", action="store_true", help="without images")
     parser.add_argument("--seed", type=int, help="seed of a single world")
     parser.add_argument("--work", type=Path, default=Path("results/sessions"), help="of recordings and maps")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
     arguments = parser.parse_args()
     size = replace(QUICK if arguments.quick else FULL, images=not arguments.lidar_only)
     kind = ("quick" if arguments.quick else "full") + ("_both_ways" if arguments.both_ways else "")
@@ -453,8 +445,7 @@ def main() -> None:
         print(json.dumps(worlds[-1]), flush=True)
     figures = {"worlds": worlds} if arguments.what else summarise(worlds)
     print(json.dumps({name: value for name, value in figures.items() if name != "worlds"}, indent=2))
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+    write_figures(arguments.json, figures)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ With `--drives` the simulated drives are kept and used again.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import pickle
 import subprocess
@@ -29,6 +28,7 @@ from umf_ros.core.config import Database, EmbeddingSettings, Loop, Verification
 from umf_ros.core.frames import Candidate, Keyframe, LoopClosure
 from umf_ros.core.geometry import Array, heading, relative, wrap_angle
 from umf_ros.embedding import make_embedder
+from umf_ros.lab.program import JsonFile, write_figures
 from umf_ros.lab.simulation.drives import SurveyedDrive, embedded, kept, worlds
 from umf_ros.lab.simulation.scenes import TRAPS, spring
 from umf_ros.lab.simulation.world import TEST
@@ -67,7 +67,7 @@ class World:
 def main(
     quick: Annotated[bool, typer.Option(help="one world")] = False,
     seed: Annotated[int, typer.Option(help="other worlds")] = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
+    json_file: JsonFile = None,
     count: Annotated[int, typer.Option("--worlds", help="how many worlds")] = 10,
     drives: Annotated[Path | None, typer.Option(help="folder that keeps simulated drives for the next time")] = None,
     weights: Annotated[str, typer.Option(help="safetensors; empty: the shipped ones")] = "",
@@ -88,8 +88,7 @@ def main(
     figures = _figures(results) | {"traps_accepted": _sprung(4 if quick else 20), "deterministic": _same_bits(sample)}
     console.print(_per_world(results))
     console.print(_summary(figures))
-    if json_file:
-        json_file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    write_figures(json_file, figures)
 
 
 def verify_sample(path: Path) -> str:

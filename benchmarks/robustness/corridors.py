@@ -9,11 +9,9 @@ look alike everywhere along them: they count for what is refused, not for recall
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -24,6 +22,7 @@ from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import Candidate
 from umf_ros.core.geometry import relative
 from umf_ros.embedding import make_embedder
+from umf_ros.lab.program import JsonFile, write_figures
 from umf_ros.lab.simulation.domains.pairs import SAME, ScanPair, is_wrong, passage_places
 from umf_ros.lab.simulation.domains.passages import PASSAGES, Passage
 from umf_ros.lab.simulation.world import TEST
@@ -38,7 +37,7 @@ def main(
     every: Annotated[int, typer.Option(help="verify every n-th pair only", min=1)] = 1,
     jobs: Annotated[int, typer.Option(help="processes", min=1)] = 1,
     only: Annotated[str, typer.Option(help="passages whose name contains this")] = "",
-    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Verify all pairs of every passage and compare with the truth."""
     console = Console()
@@ -61,9 +60,7 @@ def main(
     for name, value in figures.items():
         console.print(f"{name:12} {value}")
     console.print(f"{'refine_ms':12} {np.median(latency):.0f}")
-    if json_file:
-        content = figures | {"refine_ms": float(np.median(latency)), "passages": details}
-        json_file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_figures(json_file, figures | {"refine_ms": float(np.median(latency)), "passages": details})
 
 
 def run(passage: Passage, seed: int, every: int) -> tuple[str, Counter[str], list[float]]:

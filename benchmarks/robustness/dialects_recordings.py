@@ -1,256 +1,270 @@
-"""Recordings as other recorders, clocks and drivers leave them: the drive of a demo, on a rover of unknown make."""
+"""A drive of 46 s as other drivers, clocks and recorders write it, on a rover of unknown make."""
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import re
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 import numpy as np
-from dialect_case import Case, Check, Outcome, simulated
-from mcap.writer import CompressionType, Writer
-from zstandard import ZstdCompressor
+from dialect_case import Case, Check, last_line, line_with
+from scipy.spatial.transform import Rotation
 
-from umf_ros.bags.reader import RawMessage, decode, message_types, open_bag
-from umf_ros.core.geometry import Array, to_quaternion
-from umf_ros.core.resources import find
+from umf_ros.bags.reader import decode, message_types, open_bag
+from umf_ros.core.geometry import Array, invert, make_pose, to_quaternion
+from umf_ros.lab.program import Ended, umf
+from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.sensors.calibration import load_calibration
+from umf_ros.sensors.decode import decode_pose
 
+SEED, SECONDS = 1, 46
+CLOUD, ODOMETRY, STATIC = "/points", "/odom", "/tf_static"
+LEFT, RIGHT = "/camera/left/image_rect", "/camera/right/image_rect"
 TOPICS = {
-    "/stereo/left/image_rect": "/camera/left/image_rect",
+    "/bf_lidar/points_raw": CLOUD,
+    "/stereo/left/image_rect": LEFT,
+    "/stereo/right/image_rect": RIGHT,
     "/stereo/left/camera_info": "/camera/left/camera_info",
-    "/stereo/right/image_rect": "/camera/right/image_rect",
     "/stereo/right/camera_info": "/camera/right/camera_info",
-    "/bf_lidar/points_raw": "/points",
-    "/odom": "/odom",
-    "/ground_truth/pose": "/ground_truth/pose",
+    **{name: name for name in (ODOMETRY, "/ground_truth/pose")},
 }
-CAMERA, LIDAR, ODOMETRY = "/camera/left/image_rect", "/points", "/odom"
-Change = Callable[[RawMessage], Iterable[RawMessage]]
-Open = Callable[[str], "Recorder"]
+"""Names that are those of no data set: the rig is that of /tf_static and camera_info."""
+EPOCH_NS = 1_625_644_800_000_000_000
+Entry = tuple[int, str, Any]
+Change = Callable[[Entry], Entry]
+"""From time of recording in ns, topic and message to those that are written."""
 
 
-class Recorder:
-    """A recorder that writes mcap files; messages or the whole file are compressed on request."""
-
-    def __init__(self, path: Path, packed: bool = False) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file, self._packed = path.open("wb"), packed
-        self._writer = Writer(self._file, compression=CompressionType.LZ4)
-        self._writer.start("ros2")
-        self._channels: dict[str, int] = {}
-
-    def write(self, message: RawMessage) -> None:
-        """Append a message."""
-        if message.topic not in self._channels:
-            text = message_types().generate_msgdef(message.type, ros_version=2)[0].encode()
-            schema = self._writer.register_schema(message.type, "ros2msg", text)
-            self._channels[message.topic] = self._writer.register_channel(message.topic, "cdr", schema)
-        data = ZstdCompressor().compress(message.data) if self._packed else message.data
-        self._writer.add_message(self._channels[message.topic], message.log_ns, data, message.log_ns)
-
-    def close(self) -> None:
-        """Finish the file."""
-        self._writer.finish()
-        self._file.close()
+def base() -> Path:
+    """The drive as simulated, made once."""
+    path = Path(gettempdir()) / f"umf_dialects_{SEED}_{SECONDS}.mcap"
+    if not path.exists():
+        making = path.with_suffix(".making.mcap")
+        umf("simulate", making, "--preset", "demo", "--seed", str(SEED), "--duration", str(SECONDS))
+        making.rename(path)
+    return path
 
 
-@contextmanager
-def recording(path: Path, packed: bool = False) -> Iterator[Recorder]:
-    """Open a recorder and finish its file at the end of the block."""
-    recorder = Recorder(path, packed)
-    yield recorder
-    recorder.close()
-
-
-def encoded(kind: str, message: Any, raw: RawMessage) -> RawMessage:
-    """Return a message with other contents."""
-    return replace(raw, data=bytes(message_types().serialize_cdr(message, kind)))
-
-
-def base(folder: Path) -> Path:
-    """Return the drive with the rig on `/tf_static`, made once beside a case's folder."""
-    path = folder.parent / "base.mcap"
-    if path.exists():
-        return path
-    demo = simulated(folder.parent)
-    with recording(path.with_suffix(".part")) as out:
-        for number, raw in enumerate(open_bag(demo).raw_messages(TOPICS)):
-            if not number:
-                out.write(transforms("/tf_static", raw.log_ns))
-            message = decode(raw)
-            if raw.topic in ("/stereo/left/image_rect", "/stereo/left/camera_info", "/bf_lidar/points_raw"):
-                message.header.frame_id = "lidar" if "lidar" in raw.topic else "camera"
-            out.write(replace(encoded(raw.type, message, raw), topic=TOPICS[raw.topic]))
-    return path.with_suffix(".part").rename(path)
-
-
-def transforms(topic: str, log_ns: int) -> RawMessage:
-    """Return the places of camera and LiDAR on the body as a message of transforms."""
-    kinds = message_types().types
-    rig = load_calibration(find("config/calibration/simulated.yaml"))
-
-    def stamped(child: str, pose: Array) -> Any:
-        x, y, z = (float(number) for number in pose[:3, 3])
-        turn = dict(zip("xyzw", map(float, to_quaternion(pose)), strict=True))
-        stamp = kinds["builtin_interfaces/msg/Time"](sec=log_ns // 10**9, nanosec=log_ns % 10**9)
-        return kinds["geometry_msgs/msg/TransformStamped"](
-            header=kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="base_link"),
-            child_frame_id=child,
-            transform=kinds["geometry_msgs/msg/Transform"](
-                translation=kinds["geometry_msgs/msg/Vector3"](x=x, y=y, z=z),
-                rotation=kinds["geometry_msgs/msg/Quaternion"](**turn),
-            ),
+def _static(stamp_ns: int) -> Any:
+    """Mountings of the simulated rig as a tf2_msgs/TFMessage."""
+    types, calibration = message_types().types, load_calibration("simulated")
+    seconds, nanoseconds = divmod(stamp_ns, 10**9)
+    stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+    transforms = []
+    for child, pose in (("left_camera", calibration.body_T_camera), ("lidar", calibration.body_T_lidar)):
+        shift = types["geometry_msgs/msg/Vector3"](**dict(zip("xyz", map(float, pose[:3, 3]), strict=True)))
+        numbers = dict(zip("xyzw", map(float, to_quaternion(pose)), strict=True))
+        turn = types["geometry_msgs/msg/Quaternion"](**numbers)
+        transforms.append(
+            types["geometry_msgs/msg/TransformStamped"](
+                header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="base_link"),
+                child_frame_id=child,
+                transform=types["geometry_msgs/msg/Transform"](translation=shift, rotation=turn),
+            )
         )
-
-    kind = "tf2_msgs/msg/TFMessage"
-    message = kinds[kind](transforms=[stamped("camera", rig.body_T_camera), stamped("lidar", rig.body_T_lidar)])
-    return RawMessage(topic, log_ns, kind, bytes(message_types().serialize_cdr(message, kind)))
+    return types["tf2_msgs/msg/TFMessage"](transforms=transforms)
 
 
-def changed(change: Change, packed: bool = False) -> Callable[[Path], None]:
-    """Return a maker of `drive.mcap` with other messages."""
-
-    def make(folder: Path) -> None:
-        with recording(folder / "drive.mcap", packed) as out:
-            for raw in open_bag(base(folder)).raw_messages():
-                for message in change(raw):
-                    out.write(message)
-
-    return make
+def rewrite(change: Change, folder: Path) -> None:
+    """Write drive.mcap with the entries that `change` returns."""
+    bag = open_bag(base())
+    entries = [change((bag.start_ns, STATIC, _static(bag.start_ns)))]
+    entries += [change((raw.log_ns, TOPICS[raw.topic], decode(raw))) for raw in bag.raw_messages(TOPICS)]
+    with BagWriter(folder / "drive.mcap") as out:
+        for log_ns, topic, message in sorted(entries, key=lambda entry: entry[0]):
+            out.write(topic, message, log_ns)
 
 
-def later(seconds: float) -> Change:
-    """Recorded at another time than the headers say."""
-    return lambda raw: [replace(raw, log_ns=raw.log_ns + round(seconds * 1e9))]
+def packed(compress: Callable[[bytes], bytes], name: str, folder: Path) -> None:
+    """The drive in a file of a general compressor."""
+    rewrite(lambda entry: entry, folder)
+    (folder / name).write_bytes(compress((folder / "drive.mcap").read_bytes()))
+    (folder / "drive.mcap").unlink()
 
 
-def stamped_wrongly(topics: tuple[str, ...], ahead_s: float, count: int = 1) -> Change:
-    """Some messages in the middle with a stamp ahead of time."""
-    seen = dict.fromkeys(topics, 0)
+def logged(at: Callable[[int], int]) -> Change:
+    """Recorded at other times than the headers say, from those in ns."""
+    return lambda entry: (at(entry[0]), *entry[1:])
 
-    def change(raw: RawMessage) -> Iterable[RawMessage]:
-        if raw.topic in topics:
-            seen[raw.topic] += 1
-            if 40 <= seen[raw.topic] < 40 + count:
-                message = decode(raw)
-                stamp = message.header.stamp
-                moved_ns = stamp.sec * 10**9 + stamp.nanosec + round(ahead_s * 1e9)
-                stamp.sec, stamp.nanosec = divmod(moved_ns, 10**9)
-                return [encoded(raw.type, message, raw)]
-        return [raw]
+
+def altered(topics: tuple[str, ...], alter: Callable[[Any, int], object], rows: slice = slice(None)) -> Change:
+    """Messages of some topics altered in place, all or those of some rows, by message and number."""
+    counts = dict.fromkeys(topics, -1)
+
+    def change(entry: Entry) -> Entry:
+        if entry[1] in topics:
+            counts[entry[1]] += 1
+            if counts[entry[1]] in range(10**9)[rows]:
+                alter(entry[2], counts[entry[1]])
+        return entry
 
     return change
 
 
-def odometry(fill: Callable[[Any], None]) -> Change:
-    """Odometry whose pose is changed by a function."""
+def poses(move: Callable[[Array, int], Array], w_first: bool = False) -> Change:
+    """Odometry with its poses (4, 4) moved, by pose and number of the message."""
 
-    def change(raw: RawMessage) -> Iterable[RawMessage]:
-        if raw.topic != ODOMETRY:
-            return [raw]
-        message = decode(raw)
-        fill(message.pose.pose)
-        return [encoded(raw.type, message, raw)]
+    def alter(message: Any, number: int) -> None:
+        place, turn = message.pose.pose.position, message.pose.pose.orientation
+        moved = move(decode_pose(message.pose.pose), number)
+        place.x, place.y, place.z = map(float, moved[:3, 3])
+        turn.x, turn.y, turn.z, turn.w = map(float, np.roll(to_quaternion(moved), int(w_first)))
+
+    return altered((ODOMETRY,), alter)
+
+
+def jump(metres: float, degrees: float, rows: tuple[int, ...]) -> Change:
+    """Odometry that jumps to the left, and turns, at some messages."""
+    step = make_pose(Rotation.from_euler("z", degrees, degrees=True).as_matrix(), [0, metres, 0])
+    return poses(lambda pose, row: np.linalg.matrix_power(step, sum(row >= one for one in rows)) @ pose)
+
+
+def restamped(topic: str, row: int, seconds: float, relative: bool = True) -> Change:
+    """One message whose stamp is changed by some seconds, or is this many since the epoch."""
+
+    def alter(message: Any, _: int) -> None:
+        stamp = message.header.stamp
+        moved_ns = round(seconds * 1e9) + (stamp.sec * 10**9 + stamp.nanosec if relative else 0)
+        stamp.sec, stamp.nanosec = divmod(moved_ns, 10**9)
+
+    return altered((topic,), alter, slice(row, row + 1))
+
+
+def mounted(name: str) -> Change:
+    """A mounting on /tf_static inverted."""
+
+    def alter(message: Any, _: int) -> None:
+        for one in message.transforms:
+            if one.child_frame_id == name:
+                shift, turn = one.transform.translation, one.transform.rotation
+                by = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+                moved = invert(make_pose(by, [shift.x, shift.y, shift.z]))
+                shift.x, shift.y, shift.z = map(float, moved[:3, 3])
+                turn.x, turn.y, turn.z, turn.w = map(float, to_quaternion(moved))
+
+    return altered((STATIC,), alter)
+
+
+def delayed(topics: tuple[str, ...], frames: int) -> Change:
+    """Pictures of some frames before, under the stamps of now."""
+    held: dict[str, list[Any]] = {topic: [] for topic in topics}
+
+    def change(entry: Entry) -> Entry:
+        _, topic, message = entry
+        if topic in topics:
+            held[topic].append(message.data)
+            message.data = held[topic][max(0, len(held[topic]) - 1 - frames)]
+        return entry
 
     return change
 
 
-def no_position(pose: Any) -> None:
-    """Leave the position empty."""
-    pose.position.x = pose.position.y = pose.position.z = 0.0
+def twist_only(message: Any, _: int) -> None:
+    """No pose, and a bias of the angular rate."""
+    place, turn = message.pose.pose.position, message.pose.pose.orientation
+    place.x = place.y = place.z = turn.x = turn.y = turn.z = turn.w = 0.0
+    message.twist.twist.angular.z += 0.003
 
 
-def no_pose(pose: Any, w: float = 1.0) -> None:
-    """Leave position and orientation empty."""
-    no_position(pose)
-    turn = pose.orientation
-    turn.x, turn.y, turn.z, turn.w = 0.0, 0.0, 0.0, w
+def wide_pair(message: Any, _: int) -> None:
+    """A right camera 20 m away."""
+    message.p = np.array(message.p, float)
+    message.p[3] = -579.5 * 20
 
 
-def no_orientation(pose: Any) -> None:
-    """Leave the orientation empty."""
-    turn = pose.orientation
-    turn.x, turn.y, turn.z, turn.w = 0.0, 0.0, 0.0, 1.0
+def metric_grey(message: Any, _: int) -> None:
+    """An image of floats from 0 to 1."""
+    pixels = message.data.reshape(message.height, message.width).astype("<f4") / 255
+    message.encoding, message.step = "32FC1", pixels[0].nbytes
+    message.data = np.frombuffer(pixels.tobytes(), np.uint8)
 
 
-def in_namespace(raw: RawMessage) -> Iterable[RawMessage]:
-    """Topics of a robot in a namespace, the transforms included."""
-    return [raw if raw.topic.startswith("/ground_truth") else replace(raw, topic="/a200_0000" + raw.topic)]
+def judged(ended: Ended) -> tuple[int, int]:
+    """Return the numbers of true and of false closures."""
+    found = re.search(r"(\d+) true and (\d+) false", " ".join(ended.lines))
+    return (int(found[1]), int(found[2])) if found else (-1, -1)
 
 
-def on_tf(raw: RawMessage) -> Iterable[RawMessage]:
-    """Static transforms repeated on /tf beside the odometry, as tf1's publishers do."""
-    if raw.topic == "/tf_static":
-        return []
-    return [raw, transforms("/tf", raw.log_ns)] if raw.topic == ODOMETRY else [raw]
+@cache
+def plain() -> int:
+    """True closures of the drive as it is."""
+    with TemporaryDirectory() as folder:
+        rewrite(lambda entry: entry, Path(folder))
+        return judged(umf(*REPLAY, folder=Path(folder)))[0]
 
 
-def packed_as_a_whole(folder: Path) -> None:
-    """One zstd frame around an ordinary mcap."""
-    with base(folder).open("rb") as file, (folder / "drive.mcap.zstd").open("wb") as out:
-        ZstdCompressor().copy_stream(file, out)
+def _closes(text: str, ended: Ended, _: Path) -> tuple[bool, str]:
+    """Nine in ten of the drive's closures, none false, and a line that names the fault where there is one."""
+    (true, false), line = judged(ended), line_with(ended, text) if text else ""
+    right = true >= 0.9 * plain() > 0 == false and bool(line) == bool(text)
+    return right, f"{true} of {plain()}, {false} false; {line or last_line(ended)}"
 
 
-def in_parallel(folder: Path) -> None:
-    """One recorder for each sensor, in one folder."""
-    outs: dict[str, Recorder] = {}
-    for raw in open_bag(base(folder)).raw_messages():
-        name = "camera" if raw.topic.startswith("/camera") else "lidar" if raw.topic == LIDAR else "robot"
-        if name not in outs:
-            outs[name] = Recorder(folder / "drive" / f"{name}_0.mcap")
-        outs[name].write(raw)
-    for one in outs.values():
-        one.close()
+def _tells(text: str, is_withheld: bool, ended: Ended, _: Path) -> tuple[bool, str]:
+    """A line that names the fault, and no false closure; none at all where they have to be withheld."""
+    (true, false), line = judged(ended), line_with(ended, text)
+    right = bool(line) and false <= 0 and (true <= 0 or not is_withheld)
+    return right, f"{true} true, {false} false; {line or last_line(ended)}"
 
 
-def closes(least: float = 0.9) -> Check:
-    """Return a check of a replay: no false closure, and at least a share of the right ones of the drive as it is."""
-
-    def check(outcome: Outcome) -> tuple[bool, str]:
-        said = re.search(r"(\d+) true and (\d+) false", " ".join(outcome.lines))
-        if said is None:
-            return False, outcome.in_short
-        true, false = int(said[1]), int(said[2])
-        error = re.search(r"trajectory error [^;]*?optimised", " ".join(outcome.lines))
-        return false == 0 and true >= least * RIGHT, f"{true} true, {false} false, {error[0] if error else ''}"
-
-    return check
+def _case(name: str, change: Change, expected: str, check: Check) -> Case:
+    return Case(name, partial(rewrite, change), REPLAY, expected, check)
 
 
-RIGHT = 28
-"""Right closures of the drive as it is, by `umf replay`."""
+def _right(name: str, change: Change, text: str = "") -> Case:
+    expected = "all closures, none false" + (f"; a line: {text}" if text else "")
+    return _case(name, change, expected, partial(_closes, text))
 
 
-def case(name: str, make: Callable[[Path], object], file: str = "drive.mcap", least: float = 0.9) -> Case:
-    """Return a case whose replay has to close the loops of the drive."""
-    arguments = "replay", file, "--out", "results"
-    return Case(name, make, arguments, f"at least {np.ceil(least * RIGHT):.0f} true, 0 false", closes(least))
+def _withheld(name: str, change: Change, text: str) -> Case:
+    return _case(name, change, f"none believed; a line: {text}", partial(_tells, text, True))
 
 
+def _told(name: str, change: Change, text: str) -> Case:
+    return _case(name, change, f"none false; a line: {text}", partial(_tells, text, False))
+
+
+def _refused(end: str, compress: Callable[[bytes], bytes]) -> Case:
+    def names(ended: Ended, _: Path) -> tuple[bool, str]:
+        return bool(line_with(ended, end)), last_line(ended)
+
+    return Case(f"11 {end}", partial(packed, compress, f"a.mcap.{end}"), ("replay", f"a.mcap.{end}"), end, names)
+
+
+REPLAY = ("replay", "drive.mcap", "--out", "runs")
 CASES = [
-    case("00 as it is", changed(lambda raw: [raw])),
-    case("01 compressed messages", changed(lambda raw: [raw], packed=True)),
-    case("01 compressed file", packed_as_a_whole, "drive.mcap.zstd"),
-    case("02 parallel recorders", in_parallel, "drive"),
-    case("03 namespace", changed(in_namespace)),
-    case("03 transforms on /tf", changed(on_tf)),
-    case("04 twist only", changed(odometry(no_pose))),
-    case("04 quaternion of zeros", changed(odometry(lambda pose: no_pose(pose, 0.0)))),
-    case("04 heading only", changed(odometry(no_position))),
-    case("04 position only", changed(odometry(no_orientation))),
-    *(
-        case(f"08 {what} {ahead_s:g} s ahead", changed(stamped_wrongly(topics, ahead_s)))
-        for what, topics in {"scan": (LIDAR,), "odometry": (ODOMETRY,), "image": (CAMERA,)}.items()
-        for ahead_s in (2.0, 3600.0)
+    _right("00 as it is", lambda entry: entry),
+    _withheld("01 LiDAR's mounting inverted", mounted("lidar"), "LiDAR's mounting is off"),
+    _told("01 camera's mounting inverted", mounted("left_camera"), "camera's mounting is off"),
+    _withheld("01 odometry w first", poses(lambda pose, _: pose, w_first=True), "odometry"),
+    _told("01 odometry in millimetres", poses(lambda p, _: make_pose(p[:3, :3], 1e3 * p[:3, 3])), "position jump"),
+    _right("05 logged at once", logged(lambda log_ns: EPOCH_NS)),
+    _right("05 logged at half speed", logged(lambda log_ns: 2 * log_ns - EPOCH_NS)),
+    _right("05 logged in 1970", logged(lambda log_ns: log_ns - EPOCH_NS)),
+    _right("05 logged a year later", logged(lambda log_ns: log_ns + 365 * 86_400 * 10**9)),
+    _right("05 scan of stamp 0", restamped(CLOUD, 60, 0, relative=False)),
+    _right("05 odometry of stamp 0", restamped(ODOMETRY, 60, 0, relative=False)),
+    _right("05 first odometry of stamp 0", restamped(ODOMETRY, 0, 0, relative=False)),
+    _right("05 first scan an hour ahead", restamped(CLOUD, 0, 3600)),
+    _right("05 scan 3 s behind", restamped(CLOUD, 60, -3)),
+    _right(
+        "07 baseline of 20 m", altered((TOPICS["/stereo/right/camera_info"],), wide_pair), "left camera is used alone"
     ),
-    case("08 three scans ahead", changed(stamped_wrongly((LIDAR,), 3600.0, 3)), least=0.7),
-    case("08 a pair of images ahead", changed(stamped_wrongly((CAMERA, CAMERA.replace("left", "right")), 3600.0))),
-    *(
-        case(f"24 {name}", changed(later(seconds)))
-        for name, seconds in {"a year later": 365 * 86400.0, "TAI": 37.0, "no clock": 100 - 1.6256e9}.items()
-    ),
+    _right("08 twist only with a biased gyroscope", altered((ODOMETRY,), twist_only)),
+    _refused("gz", gzip.compress),
+    _refused("bz2", bz2.compress),
+    _right("13 32FC1", altered((LEFT, RIGHT), metric_grey)),
+    _right("14 jump of 0.5 m", jump(0.5, 0, (600,))),
+    _right("14 jump of 1.9 m", jump(1.9, 0, (600,))),
+    _right("14 jump of 20 deg", jump(0, 20, (600,))),
+    _right("14 jump of 1 m during a scan of a match", jump(1, 0, (135,))),
+    _right("14 jump of 8 deg during a scan of a match", jump(0, 8, (135,))),
+    _right("14 two jumps of 1 m", jump(1, 0, (400, 700))),
+    _told("20 left image late", delayed((LEFT,), 1), "images"),
+    _told("20 both images late", delayed((LEFT, RIGHT), 2), "the camera's clock is about"),
 ]

@@ -31,34 +31,9 @@ from umf_ros.sensors.decode import OdometrySample
 
 Rng = np.random.Generator
 Read = Callable[[Path], object]
-WORDS = [
-    "nan",
-    "-inf",
-    "1e300",
-    "1e-300",
-    "-1",
-    "0",
-    "9" * 5000,
-    "1" + "0" * 30,
-    "2147483648",
-    "!!int ''",
-    "!!bool maybe",
-]
-WORDS += [
-    "&a [*a]",
-    "{a: {a: 1}}",
-    "[" * 3000,
-    "\0",
-    "\u2603",
-    "null",
-    "'",
-    "",
-    "\t",
-    "1e30 1e30",
-    "true",
-    ".nan",
-    ".inf",
-]
+WORDS = ["nan", "-inf", "1e300", "1e-300", "-1", "0", "9" * 5000, "1" + "0" * 30, "2147483648", "!!int ''"]
+WORDS += ["!!bool maybe", "&a [*a]", "{a: {a: 1}}", "[" * 3000, "\0", "\u2603", "null", "'", "", "\t", "1e30 1e30"]
+WORDS += ["true", ".nan", ".inf"]
 NUMBERS = [None, 0, -1, 1, 2**31, 2**63 - 1, -(2**63), 1e300, "x", b"", b"\0" * 64, b"\xff" * 64, "[]", "[" * 9999]
 TRAPS = [
     "CREATE VIEW v AS SELECT 1",

@@ -26,10 +26,9 @@ from umf_ros.commands.recordings import open_recording
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, make_pose
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.detector import LoopDetector, make_detector_embedder
+from umf_ros.lab.program import replay
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.pose_graph.closures import ClosureReason, State
-from umf_ros.replay import Replay
 from umf_ros.runs.run_file import read_closures
 from umf_ros.runs.truth import absolute_trajectory_error, judge_closures
 from umf_ros.sensors.decode import OdometrySample
@@ -92,12 +91,7 @@ def disturbed(odometry: Trajectory, case: str, gap_s: float) -> Trajectory:
 def replayed(path: Path, odometry: Trajectory | None, folder: Path) -> list[LoopClosure]:
     """Return the closures that a replay with this odometry finds, or with the recording's own."""
     recording, settings = open_recording(path, None)
-    reader = FrameReader(recording, settings, odometry)
-    replay = Replay(folder, settings, LoopDetector(settings, make_detector_embedder(settings)))
-    for _ in replay.run(reader.stream()):
-        pass
-    replay.finish({})
-    replay.raise_if_frames_failed()
+    replay(recording, settings, folder, odometry)
     return read_closures(folder / "closures.csv")
 
 

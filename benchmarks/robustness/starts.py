@@ -8,7 +8,6 @@ first keyframes; a node once it says that it is ready.
 
 from __future__ import annotations
 
-import json
 import signal
 import subprocess
 import sys
@@ -22,6 +21,8 @@ from typing import Annotated
 
 import typer
 
+from umf_ros.lab.program import UMF, JsonFile, umf, write_figures
+
 LIMIT_S = 60.0
 NODES = ("loop_closure_node", "pose_graph_node")
 SPIN = "while True: sum(range(10000))"
@@ -31,13 +32,13 @@ def main(
     starts: Annotated[int, typer.Option(help="of the replay and of each node")] = 100,
     busy: Annotated[int, typer.Option(help="processes that compute beside them")] = 3,
     seed: Annotated[int, typer.Option(help="of the recording")] = 20007,
-    json_file: Annotated[Path | None, typer.Option("--json", help="write the figures to this file")] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Count hangs and failures of many starts."""
     figures: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as folder, loaded(busy):
         bag = Path(folder) / "drive.mcap"
-        subprocess.run([*UMF, "simulate", str(bag), "--seed", str(seed), "--duration", "4"], check=True)
+        umf("simulate", bag, "--seed", str(seed), "--duration", "4")
         commands = {"replay": [*UMF, "replay", str(bag), "--out", folder]}
         named = ["--ros-args", "-p", "dataset:=simulated"]  # else they wait for topics
         commands |= {name: [sys.executable, "-m", f"umf_ros.nodes.{name}", *named] for name in NODES}
@@ -45,11 +46,7 @@ def main(
             ends = Counter(start(command, name != "replay") for _ in range(starts))
             figures |= {f"{name}_{end}": ends[end] for end in ("fine", "hangs", "failures")}
             typer.echo(f"{name:20} {dict(ends)}")
-    if json_file:
-        json_file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
-
-
-UMF = [sys.executable, "-m", "umf_ros.cli"]
+    write_figures(json_file, figures)
 
 
 def start(command: list[str], interrupt: bool) -> str:

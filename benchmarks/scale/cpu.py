@@ -8,32 +8,22 @@ its CPU time holds start and report as well. The parts are wall times of the ste
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import os
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 
-ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
-UMF = sys.executable, "-m", "umf_ros.cli"
+from umf_ros.lab.program import parser_of, umf, write_figures
+
+os.environ["OMP_NUM_THREADS"] = "1"
 
 
 def replay(recording: Path, folder: Path) -> dict[str, float]:
     """Return the figures of one replay: CPU and wall time, of keyframes and their steps, and memory."""
-    command = [*UMF, "replay", str(recording), "--out", str(folder)]
-    start = time.monotonic()
-    process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise SystemExit(f"umf replay ended with {process.returncode}")
-    wall_s, cpu_s = time.monotonic() - start, usage.ru_utime + usage.ru_stime
+    ended = umf("replay", recording, "--out", folder)
     summary = json.loads((folder / "latest" / "summary.json").read_text(encoding="utf-8"))
     with (folder / "latest" / "latencies.csv").open(encoding="utf-8") as file:
         rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
@@ -42,27 +32,29 @@ def replay(recording: Path, folder: Path) -> dict[str, float]:
     return {
         "scans": scans,
         "keyframes": len(rows),
-        "CPU per scan, ms": 1e3 * cpu_s / scans,
-        "times real time": 1e-9 * (rows[-1]["stamp_ns"] - rows[0]["stamp_ns"]) / wall_s,
+        "CPU per scan, ms": 1e3 * ended.cpu_s / scans,
+        "times real time": 1e-9 * (rows[-1]["stamp_ns"] - rows[0]["stamp_ns"]) / ended.wall_s,
         **{f"{name}, ms": float(np.median([row[name] for row in rows])) for name in parts},
         "keyframe, ms, p95": float(np.percentile([row["total"] for row in rows], 95)),
-        "memory, MB": usage.ru_maxrss / 1024,
+        "memory, MB": ended.memory_mb,
     }
 
 
 def main() -> None:
     """Print the medians."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("recording", nargs="?", type=Path)
     parser.add_argument("--runs", type=int, default=3)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         recording = given.recording or Path(folder) / "demo.mcap"
         if given.recording is None:
-            subprocess.run([*UMF, "simulate", str(recording), "--preset", "demo", "--seed", "1"], check=True)
+            umf("simulate", recording, "--preset", "demo", "--seed", "1")
         runs = [replay(recording, Path(folder) / str(number)) for number in range(given.runs)]
-    for name in runs[0]:
-        print(f"{name:24} {np.median([run[name] for run in runs]):.4g}")
+    medians = {name: float(np.median([run[name] for run in runs])) for name in runs[0]}
+    for name, value in medians.items():
+        print(f"{name:24} {value:.4g}")
+    write_figures(given.json, medians)
 
 
 if __name__ == "__main__":

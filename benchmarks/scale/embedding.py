@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Sequence
@@ -22,6 +21,7 @@ from umf_ros.embedding import FeatureRequest
 from umf_ros.embedding.runtimes import MODEL_SUFFIX, Arrays, OpenVinoRuntime, Runtime, make_runtime, outputs_of
 from umf_ros.lab.datasets.views import read_frame
 from umf_ros.lab.fit.quantisation import export_model, image_input, rendered_frames, save_model
+from umf_ros.lab.program import JsonFile, write_figures
 from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.networks.config import XFEAT_OUTPUTS, read_config
 
@@ -36,7 +36,7 @@ def main(
         "runs/calibration"
     ),
     device: Annotated[str, typer.Option(help="cuda compares a GPU in half precision with torch on the CPU.")] = "cpu",
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Run both networks in both precisions, on one thread of a CPU; what else runs on the machine slows both alike."""
     seeds = range(VALIDATION.start, VALIDATION.start + worlds)
@@ -45,9 +45,8 @@ def main(
     figures = {name: measure(name, frames, repeats, device) for name in ("umf_scene", "xfeat")}
     total = {kind: sum(found[f"{kind}_ms"] for found in figures.values()) for kind in ("float32", "shipped")}
     show(figures, total["shipped"] / total["float32"])
-    if json_file is not None:
-        content = {"networks": figures, "ratio": total["shipped"] / total["float32"], "frames": len(frames)}
-        json_file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    ratio = total["shipped"] / total["float32"]
+    write_figures(json_file, {"networks": figures, "ratio": ratio, "frames": len(frames)})
 
 
 def measure(name: str, frames: Sequence[Frame], repeats: int, device: str) -> dict[str, Any]:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import resource
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
@@ -18,6 +16,7 @@ from rich.table import Table
 
 from umf_ros.core.frames import Image, StereoCamera
 from umf_ros.core.geometry import Array, heading, invert, relative, transform, wrap_angle
+from umf_ros.lab.program import JsonFile, write_figures
 from umf_ros.lab.simulation.camera import Rendering
 from umf_ros.lab.simulation.families import FAMILIES
 from umf_ros.lab.simulation.lidar import PERIOD_NS, Lidar
@@ -34,7 +33,7 @@ NEAR_M, NEAR_DEG = 12.0, 30.0
 def main(
     quick: Annotated[bool, typer.Option("--quick", help="A smaller sample, in under three minutes.")] = False,
     seed: Annotated[int, typer.Option(help="First of the worlds.")] = TEST.start,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Measure the simulator on worlds from `seed` on."""
     console = Console()
@@ -52,8 +51,7 @@ def main(
     for name in ("thumbnail", "orb"):
         figures[f"{name}_recall1_hard"] = float(np.mean([world[name] for world in worlds]))
     show(console, figures, worlds)
-    if json_file is not None:
-        json_file.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    write_figures(json_file, figures)
 
 
 def fullres_ms(simulator: Simulator, count: int) -> float:

@@ -14,13 +14,14 @@ from scipy.spatial.transform import Rotation
 from umf_ros.absolute.measurement import AbsoluteMeasurement, AbsoluteReason, Aid
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.frames import State
-from umf_ros.core.geometry import align, heading, transform
+from umf_ros.core.geometry import heading
 from umf_ros.durable_graph import DurableGraph
 from umf_ros.graph_process import JOURNAL
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, AbsoluteWorld, open_ground
 from umf_ros.pose_graph import backend
 from umf_ros.pose_graph.backend import PoseGraph
 from umf_ros.runs.run_file import read_absolute_verdicts
+from umf_ros.runs.truth import absolute_trajectory_error
 from umf_ros.sensors.decode import OdometrySample
 
 WORLD = open_ground(10_000, 500.0)
@@ -48,9 +49,7 @@ def drive(measurements: list[AbsoluteMeasurement], closures: bool = True, **sett
 def error_m(graph: PoseGraph) -> float:
     stamps, poses = graph.trajectory()
     truth = WORLD.graph.truth[stamps // PERIOD_NS][:, :3, 3]
-    return float(
-        np.sqrt(np.square(transform(align(poses[:, :3, 3], truth)[0], poses[:, :3, 3]) - truth).sum(axis=1).mean())
-    )
+    return absolute_trajectory_error(poses[:, :3, 3], truth)
 
 
 def states(graph: PoseGraph, source: Aid) -> Counter[State]:

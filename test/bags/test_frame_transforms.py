@@ -8,29 +8,28 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recordings import CLOUD, LEFT, ODOMETRY, START_NS, Entry, header, make, small_settings, traverse, write_mcap
+from recordings import (
+    CLOUD,
+    LEFT,
+    ODOMETRY,
+    START_NS,
+    Entry,
+    make,
+    small_settings,
+    transform,
+    traverse,
+    write_mcap,
+)
 
 from umf_ros.bags.frames import FrameReader, read_transforms
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.frames import Frame
-from umf_ros.core.geometry import invert, make_pose, to_quaternion
+from umf_ros.core.geometry import invert, make_pose
 from umf_ros.sensors.tf import constant_transforms
 
 CAMERA = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.4, 0.1, 1.2])
 LIDAR = make_pose(np.eye(3), [0.3, 0.0, 1.3])
 IMU = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.2, 0.0, 0.5])
-
-
-def transform(parent: str, child: str, pose: np.ndarray) -> Any:
-    x, y, z = map(float, pose[:3, 3])
-    turn = dict(zip("xyzw", map(float, to_quaternion(pose)), strict=True))
-    moved = make(
-        "geometry_msgs/msg/Transform",
-        translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-        rotation=make("geometry_msgs/msg/Quaternion", **turn),
-    )
-    kind = "geometry_msgs/msg/TransformStamped"
-    return make(kind, header=header(START_NS, parent), child_frame_id=child, transform=moved)
 
 
 def recording(

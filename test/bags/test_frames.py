@@ -17,7 +17,6 @@ from recordings import (
     scan,
     small_settings,
     traverse,
-    write_db3,
     write_mcap,
     write_ros1,
 )
@@ -67,14 +66,6 @@ def test_the_stream_holds_every_message_of_the_odometry_before_the_frames_that_n
         assert heard[-1] >= item.stamp_ns
     assert frames == SCANS
     assert heard == stamps.tolist()
-
-
-def test_the_format_does_not_matter(tmp_path: Path) -> None:
-    settings = small_settings(tmp_path)
-    first = list(FrameReader(open_bag(write_mcap(tmp_path / "a.mcap", ENTRIES)), settings))
-    second = list(FrameReader(open_bag(write_db3(tmp_path / "b", ENTRIES)), settings))
-    assert [(f.stamp_ns, f.image_stamp_ns) for f in first] == [(f.stamp_ns, f.image_stamp_ns) for f in second]
-    assert all(np.array_equal(a.points, b.points) for a, b in zip(first, second, strict=True))
 
 
 def test_topics_that_are_missing_are_not_waited_for(tmp_path: Path) -> None:
@@ -154,7 +145,10 @@ def test_a_topic_of_another_type_is_refused(tmp_path: Path) -> None:
 
 
 def test_bytes_that_are_no_message_are_skipped_and_counted(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", ENTRIES, garble=lambda i, topic: topic == CLOUD and i % 3 == 0)
+    def halved(number: int, topic: str, data: bytes) -> bytes:
+        return data[: len(data) // 2] if topic == CLOUD and number % 3 == 0 else data
+
+    path = write_mcap(tmp_path / "a.mcap", ENTRIES, change=halved)
     told: list[str] = []
     reader = FrameReader(open_bag(path), small_settings(tmp_path), warn=told.append)
     frames = list(reader)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bz2
 import gc
 import os
 import resource
@@ -92,13 +91,6 @@ def test_a_chunk_that_claims_gigabytes_is_not_unpacked(tmp_path: Path) -> None:
         read(path, tmp_path)
     assert "\n" not in str(caught.value)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
-
-
-def test_a_bzip2_chunk_is_unpacked_to_a_limit_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert unpack("bz2", bz2.compress(b"abc" * 1000)) == b"abc" * 1000
-    monkeypatch.setattr("umf_ros.core.limits.LARGEST_UNPACKED", 2**16)
-    with pytest.raises(ValueError, match="too large"):
-        unpack("bz2", bz2.compress(bytes(2**20)))
 
 
 def zeros_in_lz4(count: int) -> bytes:

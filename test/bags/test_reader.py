@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from mcap.writer import Writer as McapWriter
 from recordings import (
     CLOUD,
     LEFT,
@@ -59,21 +58,14 @@ def write_db3_without_metadata(path: Path) -> Path:
     return path
 
 
-def raw_mcap(path: Path, entries: list[Entry], packed: bool = False, **options: Any) -> Path:
-    """An mcap of another writer; `packed`: each message is a zstd frame, as `--compression-mode message` makes it."""
-    with path.open("wb") as file:
-        writer = McapWriter(file, **options)
-        writer.start("other")
-        channels: dict[str, int] = {}
-        for topic, log_ns, message in entries:
-            kind = message.__msgtype__
-            if topic not in channels:
-                text = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
-                channels[topic] = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
-            data = bytes(STORE.serialize_cdr(message, kind))
-            writer.add_message(channels[topic], log_ns, ZstdCompressor().compress(data) if packed else data, log_ns)
-        writer.finish()
-    return path
+def raw_mcap(path: Path, entries: list[Entry], **options: Any) -> Path:
+    """An mcap of another writer, in one chunk."""
+    return write_mcap(path, entries, chunk_size=2**20, profile="other", **options)
+
+
+def packed_message(number: int, topic: str, data: bytes) -> bytes:
+    """A zstd frame, as `--compression-mode message` makes it of each message."""
+    return ZstdCompressor().compress(data)
 
 
 def packed_file(folder: Path) -> Path:
@@ -138,7 +130,7 @@ def write_db3_part(folder: Path, entries: list[Entry]) -> Path:
 BY_TOPIC = sorted(ENTRIES, key=lambda entry: entry[0])
 BARE = {"use_chunking": False, "use_statistics": False, "use_summary_offsets": False}
 FORMATS: dict[str, Callable[[Path], Path]] = {
-    "mcap with packed messages": lambda folder: raw_mcap(folder / "a.mcap", ENTRIES, True),
+    "mcap with packed messages": lambda folder: raw_mcap(folder / "a.mcap", ENTRIES, change=packed_message),
     "mcap packed as a whole": lambda folder: next(packed_file(folder / "b").iterdir()),
     "folder of an mcap packed as a whole": lambda folder: packed_file(folder / "b"),
     "db3 with packed messages": lambda folder: packed_db3(folder / "b"),
@@ -278,14 +270,6 @@ def test_missing_file_and_foreign_folder(tmp_path: Path) -> None:
 def test_recording_without_messages_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="holds no message"):
         open_bag(write_mcap(tmp_path / "a.mcap", []))
-
-
-def test_truncated_ros1_bag_says_so(tmp_path: Path) -> None:
-    path = FORMATS["ROS 1"](tmp_path)
-    path.write_bytes(path.read_bytes()[:-4000])
-    with pytest.raises(BagError, match="cannot be read") as caught:
-        open_bag(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_data_sets_are_told_by_their_topics(tmp_path: Path) -> None:

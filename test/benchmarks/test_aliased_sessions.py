@@ -1,7 +1,8 @@
 """Joint graphs of sessions reject groups of wrong closures."""
 
 import pytest
-from support import aliased_sessions
+
+from benchmarks.accuracy import aliased_sessions
 
 
 @pytest.mark.parametrize(("kind", "share"), [("groups", 0.5), ("near", 0.5)])

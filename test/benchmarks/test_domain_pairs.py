@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from conftest import make_keyframe
 from scipy.spatial.transform import Rotation
-from support.domain_outcomes import Outcome, summary
 
+from benchmarks.accuracy.domains import Outcome, summary
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.lab.simulation.domains import Domain, DomainScan

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from support import planted_faults
 
+from benchmarks.accuracy import planted_faults
 from umf_ros.bags.reader import open_bag
 from umf_ros.core.config import load_settings
 

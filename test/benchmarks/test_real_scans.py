@@ -7,8 +7,8 @@ import pytest
 from conftest import make_keyframe
 from measurements import GOOD
 from scipy.spatial.transform import Rotation
-from support.real_pairs import RealPair, cropped, draw_pairs, read_pairs, summary
 
+from benchmarks.accuracy.real_scans import RealPair, cropped, draw_pairs, read_pairs, summary
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.core.geometry import make_pose
 from umf_ros.sensors.decode import Cloud

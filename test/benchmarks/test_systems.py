@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.peer_scans import Scans, found
-from support.system_scores import OURS, SETTINGS, FoundClosure, SystemRun, drive_of, judge
 
+from benchmarks.accuracy.system_peers import Scans, found
+from benchmarks.accuracy.systems import OURS, SETTINGS, FoundClosure, SystemRun, drive_of, judge
 from umf_ros.core.config import Loop
 from umf_ros.core.geometry import make_pose, relative
 from umf_ros.core.trajectory import Trajectory

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import psycopg
 import pytest
 from command_line import only_line, umf
-from support.postgres import PASSWORD, PostgresServer, free_port
 
+from benchmarks.accuracy.postgres import PASSWORD, PostgresServer, free_port
 from umf_ros.core.config import parse_settings
 from umf_ros.core.errors import ConfigError
 

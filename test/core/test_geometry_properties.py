@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -45,11 +44,6 @@ def test_relative_pose_leads_from_one_pose_to_the_other(world_T_a: Array, world_
 @given(twists)
 def test_logarithm_inverts_exponential(twist: Array) -> None:
     assert np.allclose(logmap(expmap(twist[None]))[0], twist, atol=1e-6)
-
-
-@given(twists)
-def test_tangent_order_is_that_of_gtsam(twist: Array) -> None:
-    assert np.allclose(expmap(twist[None])[0], gtsam.Pose3.Expmap(twist).matrix(), atol=1e-6)
 
 
 @given(poses)

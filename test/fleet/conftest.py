@@ -6,8 +6,8 @@ from pathlib import Path
 import psycopg
 import pytest
 from fleets import IDENTITY, ROVERS, administrator
-from support.postgres import PASSWORD, PostgresServer
 
+from benchmarks.accuracy.postgres import PASSWORD, PostgresServer
 from umf_ros.fleet.server import add_rover, migrate
 
 

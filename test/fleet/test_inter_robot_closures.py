@@ -8,8 +8,8 @@ from conftest import unit
 from fleets import IDENTITY, rover_places, settings
 from submaps_drives import Drive, rough_ground
 from submaps_drives import drive as drive_lidar
-from support.postgres import PostgresServer
 
+from benchmarks.accuracy.postgres import PostgresServer
 from umf_ros.core.config import Settings, Verification
 from umf_ros.core.errors import ConfigError
 from umf_ros.core.frames import Embedding, Keyframe

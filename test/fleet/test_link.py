@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from conftest import make_keyframe
 from fleets import IDENTITY, administrator, keyframes, rover_places, settings, stored
-from support.postgres import PASSWORD, CuttableLink, PostgresServer, free_port
 
+from benchmarks.accuracy.postgres import PASSWORD, CuttableLink, PostgresServer, free_port
 from umf_ros.core.frames import Keyframe
 from umf_ros.fleet.link import Answer, FleetLink
 from umf_ros.fleet.server import add_rover, migrate

@@ -7,8 +7,8 @@ import psycopg
 import pytest
 from conftest import make_keyframe
 from fleets import IDENTITY, administrator, stored
-from support.postgres import PASSWORD, PostgresServer, free_port
 
+from benchmarks.accuracy.postgres import PASSWORD, PostgresServer, free_port
 from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import Keyframe
 from umf_ros.fleet.server import LARGEST_PLACE, MIGRATIONS, ROVERS, FleetServer, LinkError, add_rover, migrate

@@ -7,7 +7,11 @@ from tiny_worlds import TINY
 from umf_ros.networks.umf import UMF
 
 
-@pytest.fixture
-def network() -> UMF:
+@pytest.fixture(autouse=True)
+def seed() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture
+def network(seed: None) -> UMF:
     return UMF(TINY).eval()

@@ -9,11 +9,6 @@ from torch import nn
 from umf_ros.networks.fusion import Attention, Block, received
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 @pytest.fixture
 def mask() -> torch.Tensor:
     return torch.tensor([[True, True, False, True, True], [True, False, False, False, False]])

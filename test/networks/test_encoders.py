@@ -14,11 +14,6 @@ from umf_ros.networks.encoders import Backbone, FeaturePyramid, ImageEncoder, Re
 NAMES = ("resnet18", "resnet34", "resnet50")
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 @pytest.mark.parametrize(("name", "published"), [("resnet18", 11_689_512), ("resnet34", 21_797_672)])
 def test_the_resnets_have_the_published_parameters(name, published):
     """Less the classifier (512 x 1000 and its bias), and two of the three colours of the stem (2 x 64 x 7 x 7)."""

@@ -13,11 +13,6 @@ from umf_ros.networks.fusion import AbsentToken, Fused, Fusion, GeneralisedMean,
 YES, NO = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool)
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 def tokens(count: int, existing: int) -> Tokens:
     mask = (torch.arange(count) < existing).expand(2, count)
     return Tokens(torch.randn(2, count, TINY.tokens), mask)

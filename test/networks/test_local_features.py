@@ -13,11 +13,6 @@ from umf_ros.networks.local_features import WINDOW, CloudLocal, ImageLocal, Iter
 ROWS, COLUMNS = TINY.image_size[0] // 4, TINY.image_size[1] // 4
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 def silence(block: Block) -> None:
     """Make a block the identity."""
     for layer in (block.attention.output, block.feedforward[-1]):

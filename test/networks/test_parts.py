@@ -4,7 +4,7 @@ import torch
 from tiny_worlds import TINY
 
 from umf_ros.networks.encoders import parent_and_child, take
-from umf_ros.networks.fusion import Attention, GeneralisedMean, Tokens, cell_positions, received, sine_encoding
+from umf_ros.networks.fusion import cell_positions, received, sine_encoding
 from umf_ros.networks.local_features import ImageLocal, IterativeAttention
 
 
@@ -20,33 +20,12 @@ def test_near_cells_have_nearer_codes():
     assert (codes[0] - codes[1]).norm() < (codes[0] - codes[2]).norm()
 
 
-def test_attention_ignores_what_is_masked():
-    torch.manual_seed(0)
-    attention = Attention(8, 2)
-    queries, keys = torch.randn(1, 3, 8), torch.randn(1, 5, 8)
-    mask = torch.tensor([[True, True, True, False, False]])
-    masked, weights = attention(queries, keys, mask)
-    alone, _ = attention(queries, keys[:, :3])
-    torch.testing.assert_close(masked, alone)
-    assert weights[..., 3:].max() < 1e-6
-    torch.testing.assert_close(weights.sum(-1), torch.ones(1, 2, 3))
-
-
 def test_even_attention_is_the_fair_share():
     even = torch.full((1, 2, 4, 5), 0.2)
     torch.testing.assert_close(received(even), torch.ones(1, 5))
     masked = torch.tensor([[[[0.5, 0.5, 0.0], [1.0, 0.0, 0.0], [0.3, 0.3, 0.4]]]])
     two = torch.tensor([[True, True, False]])
     torch.testing.assert_close(received(masked, two, two)[0, :2], torch.tensor([1.5, 0.5]))
-
-
-def test_generalised_mean_lies_between_mean_and_maximum():
-    pool = GeneralisedMean()
-    values = torch.tensor([[[1.0], [3.0], [100.0]]])
-    mask = torch.tensor([[True, True, False]])
-    assert 2.0 < pool(Tokens(values, mask)).item() < 3.0
-    pool.exponent.data.fill_(1.0)
-    assert abs(pool(Tokens(values, mask)).item() - 2.0) < 1e-5
 
 
 def test_voxels_find_their_parents():
@@ -65,7 +44,6 @@ def test_take_reads_the_named_cells():
 
 
 def test_windows_are_put_back_where_they_came_from():
-    torch.manual_seed(0)
     head = ImageLocal(TINY).eval()
     plain = torch.zeros(1, 16, 16, 24)
     marked = plain.clone()
@@ -75,13 +53,11 @@ def test_windows_are_put_back_where_they_came_from():
 
 
 def test_saliency_is_a_share_of_the_attention():
-    torch.manual_seed(0)
     found = ImageLocal(TINY).eval()(torch.randn(2, 16, 16, 24))
     torch.testing.assert_close(found.saliency.mean(1), torch.ones(2), atol=1e-4, rtol=0)
 
 
 def test_templates_share_out_the_features_that_exist():
-    torch.manual_seed(0)
     lit = IterativeAttention(inputs=8, count=4, outputs=6, iterations=3)
     mask = torch.tensor([[True] * 7 + [False] * 3])
     tokens = torch.randn(1, 10, 8)

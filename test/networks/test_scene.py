@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
 import torch
 from tiny_worlds import TINY, some_input
 
@@ -12,11 +11,6 @@ from umf_ros.networks.efficientnet import SceneDescriptor
 from umf_ros.networks.umf import UMF
 
 SCENE = replace(TINY, scene=16)
-
-
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
 
 
 def test_what_all_cells_share_is_taken_away() -> None:

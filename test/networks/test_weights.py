@@ -37,7 +37,6 @@ def test_weights_come_back(network, weights):
 
 
 def test_eight_bits_take_half_the_space_and_say_nearly_the_same(tmp_path):
-    torch.manual_seed(0)
     network = UMF(replace(TINY, width=32, tokens=64)).eval()
     paths = {name: tmp_path / f"{name}.safetensors" for name in ("half", "int8")}
     for name, path in paths.items():

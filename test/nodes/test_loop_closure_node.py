@@ -7,19 +7,18 @@ import re
 import signal
 import sys
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from processes import Process, call_service, wait_until
+from diagnostic_msgs.msg import DiagnosticStatus
+from live_peers import Peer
+from processes import Process, wait_until
 from rcl_interfaces.msg import Log
-from rclpy.node import Node
 from recordings import POINT
 from sensor_msgs.msg import Image, PointCloud2, PointField
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from umf_ros.core.config import Database, Settings
 from umf_ros.core.resources import find
@@ -45,27 +44,16 @@ PARAMETERS = (
 START_NS = 1_700_000_000 * 10**9
 
 
-class Rig(Node):
+class Rig(Peer):
     """Publishes one camera and one LiDAR, listens to diagnostics."""
 
     def __init__(self) -> None:
-        super().__init__("rig")
+        super().__init__("loop_closure_node", "detector")
         self.images = self.create_publisher(Image, "/stereo/left/image_rect", 10)
         self.clouds = self.create_publisher(PointCloud2, "/bf_lidar/points_raw", 10)
-        self.values: dict[str, str] = {}
-        self.messages: dict[str, str] = {}
-        self.level = DiagnosticStatus.OK
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._listen, 10)
         self.scans: list[PointCloud2] = []
         self.create_subscription(PointCloud2, "/loop_closure_node/keyframe_scans", self.scans.append, 50)
         self.rng = np.random.default_rng(0)
-
-    def _listen(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            self.messages[status.name] = status.message
-            if status.name == "loop_closure_node: detector":
-                self.values = {pair.key: pair.value for pair in status.values}
-                self.level = status.level
 
     def image(self, stamp_ns: int, **changes: object) -> Image:
         pixels = self.rng.integers(0, 255, 688 * 512, np.uint8)
@@ -94,12 +82,6 @@ class Rig(Node):
 
     def count(self, name: str) -> int:
         return int(self.values.get(name, "0"))
-
-    def until(self, condition: Callable[[], bool], timeout_s: float = 30.0) -> bool:
-        return wait_until(condition, timeout_s, spin=lambda: rclpy.spin_once(self, timeout_sec=0.05))
-
-    def call(self, kind: type, service: str, request: object) -> object:
-        return call_service(self, kind, f"/loop_closure_node/{service}", request)
 
 
 @pytest.fixture
@@ -241,20 +223,20 @@ def test_services_pause_save_and_end_a_session(rig: Rig, node: Process, tmp_path
     for i in range(4):
         rig.publish_pair(START_NS + i * 213_000_000)
     assert rig.until(lambda: rig.count("places") >= 3)
-    saved = rig.call(Trigger, "save", Trigger.Request())
+    saved = rig.call("save")
     assert saved.success and saved.message.endswith(f"places saved to {tmp_path / 'map.saved.sqlite'}")
     embedder = make_detector_embedder(Settings.model_validate({"embedding": {"method": "thumbnail"}}))
     settings = Database(path=str(tmp_path / "map.saved.sqlite"))
     copy = PlaceDatabase(settings, embedder.name, embedder.dimension)
     assert len(copy) == int(saved.message.split()[0]) >= 3
     copy.close()
-    assert rig.call(SetBool, "pause", SetBool.Request(data=True)).message == "paused"
-    assert rig.until(lambda: rig.messages.get("loop_closure_node: detector") == "paused")
+    assert rig.call("pause", SetBool, SetBool.Request(data=True)).message == "paused"
+    assert rig.until(lambda: rig.message == "paused")
     before = rig.count("cloud_received")
     rig.publish_pair(START_NS + 10 * 213_000_000)
     assert not rig.until(lambda: rig.count("cloud_received") > before, timeout_s=2.5)
     places = rig.count("places")
-    answer = rig.call(Trigger, "reset", Trigger.Request())
+    answer = rig.call("reset")
     assert answer.success and "all places are kept" in answer.message
     rig.values.clear()
     assert rig.until(lambda: rig.count("places") == places)

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import rclpy
 import yaml
-from diagnostic_msgs.msg import DiagnosticArray
 from ground import BODY_T_LIDAR, WALL, pose_at, scan
+from live_peers import Peer, odometry
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMessage
-from processes import Process, call_service, wait_until
-from rclpy.node import Node
+from processes import Process, wait_until
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
-from std_srvs.srv import Trigger
 
 from umf_ros.core.config import FrameIds
 from umf_ros.core.geometry import Array
-from umf_ros.nodes.conversions import LATCHED_QOS, SCAN_FIELDS, path, to_cloud, to_header, to_pose
+from umf_ros.nodes.conversions import LATCHED_QOS, SCAN_FIELDS, path, to_cloud, to_header
 
 SECOND = 10**9
 CRATE = (8.0, 3.0, 0.4, 0.8)
@@ -31,23 +28,15 @@ LIMIT = 300_000.0
 KINDS = {"cloud": PointCloud2, "grid": OccupancyGrid}
 
 
-class Rig(Node):
+class Rig(Peer):
     """Odometry, a front-end and a back-end, and those who listen to the map."""
 
     def __init__(self) -> None:
-        super().__init__("rig")
+        super().__init__("map_node", "map")
         self.odometry = self.create_publisher(Odometry, "/odom", 50)
         self.scans = self.create_publisher(PointCloud2, "/loop_closure_node/keyframe_scans", QoSProfile(depth=50))
         self.paths = self.create_publisher(PathMessage, "/pose_graph_node/path", LATCHED_QOS)
-        self.heard: dict[str, list[tuple[float, object]]] = {}
-        self.values: dict[str, str] = {}
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
         self.count = 1
-
-    def _diagnose(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name == "map_node: map":
-                self.values = {pair.key: pair.value for pair in status.values}
 
     def listen(self, name: str) -> None:
         self.heard[name] = []
@@ -56,19 +45,10 @@ class Rig(Node):
             KINDS[name], f"/map_node/map_{name}", lambda one: take((time.monotonic(), one)), LATCHED_QOS
         )
 
-    def spin(self) -> None:
-        rclpy.spin_once(self, timeout_sec=0.02)
-
-    def until(self, condition: Callable[[], object]) -> None:
-        assert wait_until(lambda: bool(condition()), 40.0, self.spin), self.values
-
     def drive(self, things: list, poses: list[Array]) -> None:
         """Send what a rover sends, a pose per second."""
         for pose in poses:
-            header = to_header(self.count * SECOND, "odom")
-            message = Odometry(header=header, child_frame_id="base_link")
-            message.pose.pose = to_pose(pose)
-            self.odometry.publish(message)
+            self.odometry.publish(odometry(self.count * SECOND, pose))
             points = scan(pose, things)
             seen = np.hstack([points, np.broadcast_to(BODY_T_LIDAR[:3, 3], points.shape)])
             self.scans.publish(to_cloud(seen, SCAN_FIELDS, to_header(self.count * SECOND, "base_link")))
@@ -88,9 +68,6 @@ class Rig(Node):
         column, row = np.floor((np.array([x, y]) - corner) / grid.info.resolution).astype(int)
         return grid.data[row * grid.info.width + column]
 
-    def call(self, service: str) -> Trigger.Response:
-        return call_service(self, Trigger, f"/map_node/{service}", Trigger.Request())
-
 
 @pytest.fixture
 def rig(ros_context: None) -> Iterator[Rig]:
@@ -109,11 +86,11 @@ def process(tmp_path: Path) -> Iterator[Process]:
 
 def test_a_drive(rig: Rig, process: Process, tmp_path: Path) -> None:
     process.wait_for("ready")
-    rig.until(lambda: rig.scans.get_subscription_count() and rig.odometry.get_subscription_count())
+    rig.wait_for(lambda: rig.scans.get_subscription_count() and rig.odometry.get_subscription_count())
     there = [pose_at(x) for x in np.arange(0.0, 12.0, 0.5)]
     back = there[::-1]
     rig.drive([*WALL, CRATE], there)
-    rig.until(lambda: rig.values.get("keyframes_waiting") == "24")
+    rig.wait_for(lambda: rig.values.get("keyframes_waiting") == "24")
     assert not rig.call("save").success  # without a path there is no map
     rig.correct(there)
     wait_until(lambda: False, 3.0, rig.spin)
@@ -121,7 +98,7 @@ def test_a_drive(rig: Rig, process: Process, tmp_path: Path) -> None:
 
     rig.listen("cloud")
     rig.listen("grid")
-    rig.until(lambda: rig.heard["cloud"] and rig.heard["grid"])
+    rig.wait_for(lambda: rig.heard["cloud"] and rig.heard["grid"])
     assert rig.cell(8.0, 2.65) == 100 and rig.cell(4.0, 0.0) == 0 and rig.cell(8.0, 10.0) == -1
     assert rig.heard["grid"][-1][1].header.frame_id == rig.heard["cloud"][-1][1].header.frame_id == "map"
 
@@ -131,7 +108,7 @@ def test_a_drive(rig: Rig, process: Process, tmp_path: Path) -> None:
     for reach in (30, 36, 42, 48):
         rig.correct([*there, *back][:reach])
         wait_until(lambda: False, 1.5, rig.spin)
-    rig.until(lambda: rig.cell(8.0, 2.65) == 0)
+    rig.wait_for(lambda: rig.cell(8.0, 2.65) == 0)
     messages = [*rig.heard["cloud"][sent:], *rig.heard["grid"][sent:]]
     size = sum(len(one.data) for _, one in messages)
     last = sum(len(rig.heard[name][-1][1].data) for name in KINDS)  # the pause comes after it
@@ -139,15 +116,15 @@ def test_a_drive(rig: Rig, process: Process, tmp_path: Path) -> None:
 
     # the graph moves, and so does the map
     rig.correct([pose_at(pose[0, 3], 5.0) for pose in [*there, *back]])
-    rig.until(lambda: np.median(rig.points()[rig.points()[:, 2] > 1.5, 1]) > 10.5)
-    rig.until(lambda: int(rig.values["rebuilt"]) >= 1)
+    rig.wait_for(lambda: np.median(rig.points()[rig.points()[:, 2] > 1.5, 1]) > 10.5)
+    rig.wait_for(lambda: int(rig.values["rebuilt"]) >= 1)
     assert rig.values["queue_dropped"] == "0"
 
     answer = rig.call("save")
     assert answer.success and "map.yaml" in answer.message
     about = yaml.safe_load((tmp_path / "results" / "map.yaml").read_text())
     image = cv2.imread(str(tmp_path / "results" / about["image"]), cv2.IMREAD_UNCHANGED)
-    rig.until(lambda: rig.heard["grid"][-1][1].info.height == image.shape[0])
+    rig.wait_for(lambda: rig.heard["grid"][-1][1].info.height == image.shape[0])
     assert (image == 254).sum() == list(rig.heard["grid"][-1][1].data).count(0)
     assert process.interrupt() == 0
     assert (tmp_path / "results" / "elevation.tif").is_file()
@@ -155,10 +132,10 @@ def test_a_drive(rig: Rig, process: Process, tmp_path: Path) -> None:
 
 def test_a_scan_of_another_kind_is_one_line(rig: Rig, process: Process) -> None:
     process.wait_for("ready")
-    rig.until(lambda: rig.scans.get_subscription_count())
+    rig.wait_for(lambda: rig.scans.get_subscription_count())
     for stamp in range(1, 4):
         rig.scans.publish(to_cloud(np.zeros((4, 3)), ["x", "y", "z"], to_header(stamp, "base_link")))
-    rig.until(lambda: rig.values.get("scan") == "3")
+    rig.wait_for(lambda: rig.values.get("scan") == "3")
     assert process.output.count("keyframe scan without the fields") == 1
     assert process.interrupt() == 0
 
@@ -167,16 +144,16 @@ def test_a_grid_above_the_limit_shows_the_surroundings_of_the_rover(rig: Rig, tm
     process = Process("umf_ros.nodes.map_node", tmp_path / "node.log", "dataset:=s3li-etna", "terrain.max_cells:=10000")
     try:
         process.wait_for("ready")
-        rig.until(lambda: rig.scans.get_subscription_count() and rig.odometry.get_subscription_count())
+        rig.wait_for(lambda: rig.scans.get_subscription_count() and rig.odometry.get_subscription_count())
         rig.listen("grid")
         there = [pose_at(x) for x in np.arange(0.0, 12.0, 0.5)]
         rig.drive(WALL, there)
         rig.correct(there)
-        rig.until(lambda: rig.heard["grid"])
+        rig.wait_for(lambda: rig.heard["grid"])
         info = rig.heard["grid"][-1][1].info
         assert (info.width, info.height) == (100, 100)
         assert abs(info.origin.position.x + 10.0 - 11.5) < 0.3 and abs(info.origin.position.y + 10.0) < 0.3
-        rig.until(lambda: rig.values.get("grid_cropped_to", "").startswith("20 x 20 m in cells of 0.2 m instead of"))
+        rig.wait_for(lambda: rig.values.get("grid_cropped_to", "").startswith("20 x 20 m in cells of 0.2 m instead of"))
         assert process.output.count("map_grid shows only the surroundings of the rover: 20 x 20 m") == 1
         assert process.interrupt() == 0
     finally:

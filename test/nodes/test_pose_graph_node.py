@@ -7,31 +7,29 @@ import itertools
 import os
 import re
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from diagnostic_msgs.srv import AddDiagnostics
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from live_peers import Peer, odometry
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from processes import Process, call_service, wait_until
 from rcl_interfaces.srv import SetParameters
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import NavSatFix
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from umf_ros.absolute.measurement import Aid
-from umf_ros.core.geometry import Array, relative, to_quaternion
+from umf_ros.core.geometry import relative, to_quaternion
 from umf_ros.lab.datasets.g2o import read_g2o
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld, open_ground, rover_loops, with_wrong_closures
 from umf_ros.nodes.conversions import (
@@ -40,7 +38,6 @@ from umf_ros.nodes.conversions import (
     closure_to_message,
     from_time,
     parse_pair,
-    to_pose,
     to_time,
 )
 from umf_ros.sensors.decode import decode_pose
@@ -48,40 +45,20 @@ from umf_ros.sensors.decode import decode_pose
 MODULE = "umf_ros.nodes.pose_graph_node"
 
 
-class Rig(Node):
+class Rig(Peer):
     """A rover's odometry and front-end, and ears for everything the back-end says."""
 
     def __init__(self, world: GraphWorld) -> None:
-        super().__init__("rig")
+        super().__init__("pose_graph_node", "pose graph")
         self.world = world
         self.odometry = self.create_publisher(Odometry, "/odom", 50)
         self.closures = self.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS)
         self.reject = self.create_publisher(String, "/pose_graph_node/reject_edge", 10)
-        self.heard: dict[str, list] = {}
-        self._hear(PathMessage, "path", LATCHED_QOS)
-        self._hear(MarkerArray, "markers", LATCHED_QOS)
-        self._hear(DiagnosticArray, "verdicts", CLOSURES_QOS)
-        self._hear(PoseWithCovarianceStamped, "pose", qos_profile_sensor_data)
-        self._hear(TransformStamped, "map_to_odom", qos_profile_sensor_data)
-        self.values: dict[str, str] = {}
-        self.inputs: set[str] = set()
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, 10)
-
-    def _hear(self, kind: type, name: str, qos: object) -> None:
-        self.heard[name] = []
-        self.create_subscription(kind, f"/pose_graph_node/{name}", self.heard[name].append, qos)
-
-    def _diagnose(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            self.inputs.add(status.name)
-            if status.name == "pose_graph_node: pose graph":
-                self.values = {pair.key: pair.value for pair in status.values}
-
-    def spin(self) -> None:
-        rclpy.spin_once(self, timeout_sec=0.02)
-
-    def until(self, condition: Callable[[], object]) -> None:
-        assert wait_until(lambda: bool(condition()), 40.0, self.spin), self.values
+        self.hear(PathMessage, "path", LATCHED_QOS)
+        self.hear(MarkerArray, "markers", LATCHED_QOS)
+        self.hear(DiagnosticArray, "verdicts", CLOSURES_QOS)
+        self.hear(PoseWithCovarianceStamped, "pose", qos_profile_sensor_data)
+        self.hear(TransformStamped, "map_to_odom", qos_profile_sensor_data)
 
     def drive(self, first: int, last: int) -> None:
         for k in range(first, last):
@@ -97,17 +74,6 @@ class Rig(Node):
     def _answered(self, stamp_ns: int) -> bool:
         poses = self.heard["pose"]
         return bool(poses) and from_time(poses[-1].header.stamp) == stamp_ns
-
-    def call(self, service: str) -> Trigger.Response:
-        return call_service(self, Trigger, f"/pose_graph_node/{service}", Trigger.Request())
-
-
-def odometry(stamp_ns: int, pose: Array) -> Odometry:
-    message = Odometry(child_frame_id="base_link")
-    message.header.stamp = to_time(stamp_ns)
-    message.header.frame_id = "odom"
-    message.pose.pose = to_pose(pose)
-    return message
 
 
 @pytest.fixture
@@ -141,21 +107,21 @@ def verdicts(rig: Rig) -> dict[str, str]:
 
 
 def test_a_drive_ends_on_its_true_path_and_wrong_closures_stay_out(rig: Rig, process: Process, tmp_path: Path) -> None:
-    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    rig.wait_for(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
     rig.drive(0, len(rig.world.truth))
-    rig.until(lambda: rig.taken >= len(rig.world.truth) - 5)
+    rig.wait_for(lambda: rig.taken >= len(rig.world.truth) - 5)
     for row in range(len(rig.world.closures)):
         rig.closures.publish(closure_to_message(rig.world.message(row)))
-    rig.until(lambda: len(verdicts(rig)) == len(rig.world.closures))
+    rig.wait_for(lambda: len(verdicts(rig)) == len(rig.world.closures))
     names = [f"keyframe/{i * PERIOD_NS} keyframe/{j * PERIOD_NS}" for i, j, *_ in rig.world.closures]
     right = {name for name, closure in zip(names, rig.world.closures, strict=True) if closure.right}
-    rig.until(lambda: sum(v == "accepted" for v in verdicts(rig).values()) >= len(right) - 2)
+    rig.wait_for(lambda: sum(v == "accepted" for v in verdicts(rig).values()) >= len(right) - 2)
     assert {name for name, verdict in verdicts(rig).items() if verdict == "accepted"} <= right
     told = rig.heard["verdicts"][-1].status[-1]
     assert [pair.key for pair in told.values] == ["verdict", "mahalanobis", "misfit_m"]
 
     # the pose follows the odometry with the newest correction, whatever the optimiser does
-    rig.until(lambda: rig.values.get("accepted") and float(rig.values["accepted"]) >= len(right) - 2)
+    rig.wait_for(lambda: rig.values.get("accepted") and float(rig.values["accepted"]) >= len(right) - 2)
     drift_m = np.linalg.norm(rig.world.odometry[-1][:3, 3] - rig.world.truth[-1][:3, 3])
     stamps = itertools.count(len(rig.world.truth))
 
@@ -167,13 +133,13 @@ def test_a_drive_ends_on_its_true_path_and_wrong_closures_stay_out(rig: Rig, pro
         return bool(at) and bool(np.linalg.norm(at[-1] - rig.world.truth[-1][:3, 3]) < 0.5 * drift_m)
 
     # the last verdicts and the correction after them may come later than the first of these poses
-    rig.until(stands_where_it_is)
+    rig.wait_for(stands_where_it_is)
     pose = rig.heard["pose"][-1]
     assert pose.header.frame_id == "map"
     assert np.linalg.eigvalsh(np.reshape(pose.pose.covariance, (6, 6))).min() > 0
     assert rig.heard["map_to_odom"][-1].child_frame_id == "odom"
-    rig.until(lambda: len(rig.heard["path"][-1].poses) >= len(rig.world.truth) - 5)
-    rig.until(lambda: sum(len(m.points) for m in rig.heard["markers"][-1].markers) == 2 * len(rig.world.closures))
+    rig.wait_for(lambda: len(rig.heard["path"][-1].poses) >= len(rig.world.truth) - 5)
+    rig.wait_for(lambda: sum(len(m.points) for m in rig.heard["markers"][-1].markers) == 2 * len(rig.world.closures))
     green, _, red, *measured = rig.heard["markers"][-1].markers
     assert [marker.ns for marker in measured] == ["absolute accepted", "absolute pending", "absolute rejected"]
     assert (green.ns, red.ns) == ("accepted", "rejected")
@@ -189,7 +155,7 @@ def test_a_drive_ends_on_its_true_path_and_wrong_closures_stay_out(rig: Rig, pro
 
 
 def test_bad_messages_are_counted_and_the_node_goes_on(rig: Rig, process: Process) -> None:
-    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    rig.wait_for(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
     world = rig.world
     broken, undated = odometry(PERIOD_NS, world.odometry[0]), odometry(0, world.odometry[0])
     broken.pose.pose.orientation.w = 3.0
@@ -212,14 +178,14 @@ def test_bad_messages_are_counted_and_the_node_goes_on(rig: Rig, process: Proces
         rig.reject.publish(String(data="the red one"))
         return all(name in rig.values for name in wanted)
 
-    rig.until(all_counted)
-    rig.until(lambda: sum(name.startswith("closure refused") for name in rig.values) == 2)
-    rig.until(lambda: rig.taken >= 95)
+    rig.wait_for(all_counted)
+    rig.wait_for(lambda: sum(name.startswith("closure refused") for name in rig.values) == 2)
+    rig.wait_for(lambda: rig.taken >= 95)
     assert "a new session" not in process.output
 
 
 def test_no_message_ends_the_node(rig: Rig, process: Process) -> None:
-    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    rig.wait_for(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
     endless = closure_to_message(rig.world.message(0))
     endless.header.frame_id = "keyframe/" + "9" * 5000
     beyond = closure_to_message(rig.world.message(0))
@@ -234,8 +200,8 @@ def test_no_message_ends_the_node(rig: Rig, process: Process) -> None:
         "keyframe/1 keyframe/2",
     ):
         rig.reject.publish(String(data=text))
-    rig.until(lambda: rig.values.get("closure_frame") == "2" and rig.values.get("reject_edge") == "2")
-    rig.until(lambda: rig.values.get("GraphError") == "1")
+    rig.wait_for(lambda: rig.values.get("closure_frame") == "2" and rig.values.get("reject_edge") == "2")
+    rig.wait_for(lambda: rig.values.get("GraphError") == "1")
     assert process.exit_code is None and "Traceback" not in process.output
     assert max(map(len, process.output.splitlines())) < 500
 
@@ -244,16 +210,16 @@ def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Pat
     parameters = f"results_dir:={tmp_path / 'results'}", "pose_graph.max_gap_s:=3", "dataset:=simulated"
     process = Process(MODULE, tmp_path / "one.log", *parameters)
     process.wait_for("ready")
-    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    rig.wait_for(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
     rig.drive(0, len(rig.world.truth))
     for row in range(len(rig.world.closures)):
         rig.closures.publish(closure_to_message(rig.world.message(row)))
-    rig.until(lambda: len(verdicts(rig)) == len(rig.world.closures))
+    rig.wait_for(lambda: len(verdicts(rig)) == len(rig.world.closures))
     taken = -1
     while taken != rig.taken:  # until a status later nothing more has come
         taken = rig.taken
         rig.values.clear()
-        rig.until(lambda: rig.values.get("accepted"))
+        rig.wait_for(lambda: rig.values.get("accepted"))
     before, odometry_before, solver = rig.values["accepted"], rig.taken, Path(f"/proc/{process.child}")
     process.kill()
     assert wait_until(lambda: not solver.exists())
@@ -261,7 +227,7 @@ def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Pat
     again = Process(MODULE, tmp_path / "two.log", *parameters)
     again.wait_for("ready")
     assert f"recovered: {odometry_before} odometry messages" in again.output and "differ" not in again.output
-    rig.until(lambda: rig.values.get("accepted") == before)
+    rig.wait_for(lambda: rig.values.get("accepted") == before)
     second = Process(MODULE, tmp_path / "three.log", *parameters)
     wait_until(lambda: second.exit_code is not None, 120.0)
     assert second.exit_code == 1 and "is in use by another process" in second.output
@@ -274,9 +240,9 @@ def test_the_end_of_the_solver_ends_the_node_and_loses_nothing(rig: Rig, tmp_pat
     parameters = f"results_dir:={tmp_path / 'results'}", "topics.odometry:=/odom"
     process = Process(MODULE, tmp_path / "one.log", *parameters)
     process.wait_for("ready")
-    rig.until(lambda: rig.odometry.get_subscription_count())
+    rig.wait_for(lambda: rig.odometry.get_subscription_count())
     rig.drive(0, 50)
-    rig.until(lambda: rig.taken >= 45)
+    rig.wait_for(lambda: rig.taken >= 45)
     taken = rig.taken  # diagnostics are of a moment ago: the journal may hold more
     os.kill(process.child, signal.SIGKILL)
     assert wait_until(lambda: process.exit_code is not None)
@@ -293,11 +259,11 @@ def test_the_end_of_the_solver_ends_the_node_and_loses_nothing(rig: Rig, tmp_pat
 def test_a_namespace_is_a_robot(rig: Rig, process: Process, tmp_path: Path) -> None:
     other = Process(MODULE, tmp_path / "other.log", "__ns:=/other", "dataset:=simulated")
     other.wait_for("ready")
-    rig.until(lambda: rig.closures.get_subscription_count() and "other/pose_graph_node: pose graph" in rig.inputs)
+    rig.wait_for(lambda: rig.closures.get_subscription_count() and "other/pose_graph_node: pose graph" in rig.messages)
     assert {name for name, _ in rig.get_topic_names_and_types()} >= {"/other/loop_closures", "/other/odom"}
     assert rig.count_subscribers("/loop_closures") == rig.count_subscribers("/other/loop_closures") == 1
     rig.drive(0, 20)
-    rig.until(lambda: rig.taken >= 15)
+    rig.wait_for(lambda: rig.taken >= 15)
     assert other.interrupt() == 0
     other.kill()
 
@@ -313,9 +279,9 @@ def test_without_autostart_it_waits_for_its_life_cycle(rig: Rig, tmp_path: Path)
 
     step(Transition.TRANSITION_CONFIGURE)
     step(Transition.TRANSITION_ACTIVATE)
-    rig.until(lambda: rig.odometry.get_subscription_count())
+    rig.wait_for(lambda: rig.odometry.get_subscription_count())
     rig.drive(0, 20)
-    rig.until(lambda: rig.taken >= 15)
+    rig.wait_for(lambda: rig.taken >= 15)
     step(Transition.TRANSITION_DEACTIVATE)
     step(Transition.TRANSITION_CLEANUP)
     assert process.interrupt() == 0, process.output
@@ -325,7 +291,7 @@ def test_without_autostart_it_waits_for_its_life_cycle(rig: Rig, tmp_path: Path)
 def test_without_a_clock_it_says_so(rig: Rig, tmp_path: Path) -> None:
     process = Process(MODULE, tmp_path / "node.log", "use_sim_time:=true")
     process.wait_for("/clock is silent")
-    rig.until(lambda: "pose_graph_node: pose graph" in rig.inputs)
+    rig.wait_for(lambda: "pose_graph_node: pose graph" in rig.messages)
     process.kill()
 
 
@@ -336,16 +302,16 @@ def test_a_gate_changes_while_the_node_runs(rig: Rig, process: Process) -> None:
     request = SetParameters.Request(parameters=[wanted, wrong, fixed])
     answer = call_service(rig, SetParameters, "/pose_graph_node/set_parameters", request)
     assert [result.successful for result in answer.results] == [True, False, False]
-    rig.until(lambda: rig.closures.get_subscription_count())
+    rig.wait_for(lambda: rig.closures.get_subscription_count())
     rig.closures.publish(closure_to_message(rig.world.message(0)))
-    rig.until(lambda: any("absurd translation" in name for name in rig.values))
+    rig.wait_for(lambda: any("absurd translation" in name for name in rig.values))
 
 
 def test_a_rover_without_odometry_is_no_fault(rig: Rig, tmp_path: Path) -> None:
     process = Process(MODULE, tmp_path / "node.log", "topics.odometry:=''")
     process.wait_for("ready")
-    rig.until(lambda: "closures" in " ".join(rig.inputs))
-    assert not any("odometry" in name for name in rig.inputs) and process.exit_code is None
+    rig.wait_for(lambda: "closures" in " ".join(rig.messages))
+    assert not any("odometry" in name for name in rig.messages) and process.exit_code is None
     assert process.interrupt() == 0, process.output
     process.kill()
 
@@ -360,30 +326,30 @@ def test_a_folder_that_cannot_be_written_is_told_at_the_start(tmp_path: Path) ->
 
 
 def test_services_revoke_save_and_reset(rig: Rig, process: Process, tmp_path: Path) -> None:
-    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    rig.wait_for(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
     assert not rig.call("reject_last").success
     rig.drive(0, len(rig.world.truth))
-    rig.until(lambda: rig.taken >= len(rig.world.truth) - 5)
+    rig.wait_for(lambda: rig.taken >= len(rig.world.truth) - 5)
     for row in range(len(rig.world.closures)):
         rig.closures.publish(closure_to_message(rig.world.message(row)))
-    rig.until(lambda: "accepted" in verdicts(rig).values())
+    rig.wait_for(lambda: "accepted" in verdicts(rig).values())
     assert rig.call("save").success
     assert (tmp_path / "results" / "graph.g2o").is_file()
     answer = rig.call("reject_last")
     assert answer.success and "revoked" in answer.message
     match, query = answer.message.split()[1:3]
-    rig.until(lambda: verdicts(rig)[f"{match} {query}"] == "rejected")
+    rig.wait_for(lambda: verdicts(rig)[f"{match} {query}"] == "rejected")
     assert rig.call("reset").success
-    rig.until(lambda: rig.values.get("accepted") is None)
+    rig.wait_for(lambda: rig.values.get("accepted") is None)
     assert process.exit_code is None
 
 
 def test_edges_are_edited_by_hand_and_undone_by_name(rig: Rig, process: Process, tmp_path: Path) -> None:
-    rig.until(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
+    rig.wait_for(lambda: rig.odometry.get_subscription_count() and rig.closures.get_subscription_count())
     rig.drive(0, len(rig.world.truth))
     for row in range(len(rig.world.closures)):
         rig.closures.publish(closure_to_message(rig.world.message(row)))
-    rig.until(lambda: len(verdicts(rig)) == len(rig.world.closures))
+    rig.wait_for(lambda: len(verdicts(rig)) == len(rig.world.closures))
 
     def call(service: str, text: str) -> AddDiagnostics.Response:
         request = AddDiagnostics.Request(load_namespace=text)
@@ -392,7 +358,7 @@ def test_edges_are_edited_by_hand_and_undone_by_name(rig: Rig, process: Process,
     right = next(name for name, verdict in verdicts(rig).items() if verdict == "accepted")
     answer = call("reject_edge", right)
     assert answer.success and answer.message == f"closure {right} rejected: revoked by hand"
-    rig.until(lambda: verdicts(rig)[right] == "rejected")
+    rig.wait_for(lambda: verdicts(rig)[right] == "rejected")
     answer = call("undo_edit", right)
     assert answer.success and "by hand" not in answer.message
     answer = call("add_closure", right)
@@ -404,7 +370,7 @@ def test_edges_are_edited_by_hand_and_undone_by_name(rig: Rig, process: Process,
     new = f"keyframe/{10 * PERIOD_NS} keyframe/{20 * PERIOD_NS}"
     answer = call("add_closure", f"{new} {x} {y} {z} {turn} 0.1 1.0")
     assert answer.success and answer.message == f"closure {new} accepted: accepted by hand"
-    rig.until(lambda: verdicts(rig).get(new) == "accepted")
+    rig.wait_for(lambda: verdicts(rig).get(new) == "accepted")
     for text, told in (
         ("keyframe/1 keyframe/2", "no closure between keyframes 1 and 2"),
         ("nonsense", "'nonsense' is no pair of keyframes"),
@@ -420,12 +386,12 @@ def test_edges_are_edited_by_hand_and_undone_by_name(rig: Rig, process: Process,
 
 
 def test_a_clock_that_goes_back_begins_a_session(rig: Rig, process: Process) -> None:
-    rig.until(lambda: rig.odometry.get_subscription_count())
+    rig.wait_for(lambda: rig.odometry.get_subscription_count())
     rig.drive(0, 60)
-    rig.until(lambda: rig.taken >= 55)
+    rig.wait_for(lambda: rig.taken >= 55)
     rig.drive(0, 20)
     process.wait_for("a new session begins")
-    rig.until(lambda: rig.taken >= 75)
+    rig.wait_for(lambda: rig.taken >= 75)
 
 
 def test_a_wrong_parameter_is_one_line(tmp_path: Path) -> None:
@@ -450,7 +416,7 @@ def test_fixes_over_dds_are_decided_about_and_told(ros_context: None, tmp_path: 
     process = Process(MODULE, tmp_path / "node.log", f"results_dir:={results}", *arguments)
     try:
         process.wait_for("ready")
-        rig.until(lambda: rig.odometry.get_subscription_count() and fixes.get_subscription_count())
+        rig.wait_for(lambda: rig.odometry.get_subscription_count() and fixes.get_subscription_count())
         given = {one.stamp_ns // PERIOD_NS: one for one in world.measurements if one.source is Aid.GNSS}
         for k in range(len(world.graph.truth)):
             rig.drive(k, k + 1)
@@ -461,9 +427,9 @@ def test_fixes_over_dds_are_decided_about_and_told(ros_context: None, tmp_path: 
                 message.position_covariance = given[k].covariance.ravel()
                 fixes.publish(message)
         fixes.publish(NavSatFix())  # without a stamp
-        rig.until(lambda: int(rig.values.get("gnss accepted", 0)) > 100)
-        rig.until(lambda: "stamp" in rig.values)
-        assert "pose_graph_node: input gnss" in rig.inputs
+        rig.wait_for(lambda: int(rig.values.get("gnss accepted", 0)) > 100)
+        rig.wait_for(lambda: "stamp" in rig.values)
+        assert "pose_graph_node: input gnss" in rig.messages
         assert process.interrupt() == 0
     finally:
         process.kill()

@@ -161,12 +161,6 @@ def test_saving_copies_everything(tmp_path: Path) -> None:
     assert len(database(tmp_path / "sub" / "copy.sqlite")) == 1
 
 
-def test_a_database_of_another_embedder_is_refused(tmp_path: Path) -> None:
-    database(tmp_path / "map.sqlite").close()
-    with pytest.raises(UmfError, match="made with embedder test, not other"):
-        database(tmp_path / "map.sqlite", embedder="other")
-
-
 def test_a_foreign_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     path.write_text("not a database, but long enough to be looked at " * 20)

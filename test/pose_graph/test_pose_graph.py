@@ -6,14 +6,15 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
-from graph_worlds import SETTINGS, accepted, batch_optimum, drive, feed_odometry, right, rms
+from graph_worlds import SETTINGS, accepted, batch_optimum, drive, feed_odometry, right, rms, whole_graph
 
 from umf_ros.core.config import PoseGraphSettings
 from umf_ros.core.errors import GraphError
 from umf_ros.core.frames import LoopClosure
-from umf_ros.core.geometry import Array, expmap, invert, make_pose
+from umf_ros.core.geometry import Array, expmap, make_pose, ros_to_gtsam_covariance
 from umf_ros.lab.datasets.g2o import read_g2o
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops, with_wrong_closures
 from umf_ros.pose_graph.backend import PoseGraph
@@ -218,23 +219,10 @@ def test_two_sessions_are_joined_by_their_closures() -> None:
 
 
 def test_the_newest_pose_has_the_marginal_of_the_full_graph() -> None:
-    import gtsam
-
-    from umf_ros.core.geometry import ros_to_gtsam_covariance
-    from umf_ros.pose_graph.solver import between
-
     world = rover_loops(300, 12)
     graph = drive(world)
-    full, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     poses = graph.trajectory()[1]
-    full.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(poses[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
-    steps = invert(world.odometry[:-1]) @ world.odometry[1:]
-    for k, pose in enumerate(poses):
-        values.insert(k, gtsam.Pose3(pose))
-        if k:
-            full.add(between(k - 1, k, steps[k - 1], world.step_covariances[k]))
-    for closure in world.closures:
-        full.add(between(closure.first, closure.second, closure.pose, closure.covariance))
+    full, values = whole_graph(world, poses, poses[0])
     expected = gtsam.Marginals(full, values).marginalCovariance(len(poses) - 1)
     found = ros_to_gtsam_covariance(graph.covariance(), poses[-1])
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=1e-5)

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
-from graph_worlds import SETTINGS, chain_of, placed
+from graph_worlds import SETTINGS, chain_of, placed, whole_graph
 
 from umf_ros.absolute.reference import AbsoluteReference
-from umf_ros.core.geometry import invert
 from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, rover_loops
 from umf_ros.pose_graph.closures import as_closures
 from umf_ros.pose_graph.consistency import NoiseScale
 from umf_ros.pose_graph.sessions import RelativeCovariances, Sessions
-from umf_ros.pose_graph.solver import between
 
 
 def test_the_bound_of_a_relative_covariance_is_never_below_the_true_one() -> None:
@@ -23,14 +21,7 @@ def test_the_bound_of_a_relative_covariance_is_never_below_the_true_one() -> Non
     sessions.solve(closures, NoiseScale())
     relative_poses = RelativeCovariances(sessions, 1.0)
     points = chain.at(np.arange(300) * PERIOD_NS)
-    full, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    steps = invert(world.odometry[:-1]) @ world.odometry[1:]
-    for k, pose in enumerate(sessions.at(points)):
-        values.insert(k, gtsam.Pose3(pose))
-        if k:
-            full.add(between(k - 1, k, steps[k - 1], world.step_covariances[k]))
-    for closure in world.closures:
-        full.add(between(closure.first, closure.second, closure.pose, closure.covariance))
+    full, values = whole_graph(world, sessions.at(points))
     for i, j in [(3, 290), (60, 61), (20, 120), (250, 40)]:
         anchored = gtsam.NonlinearFactorGraph(full)
         anchored.add(gtsam.PriorFactorPose3(i, values.atPose3(i), gtsam.noiseModel.Isotropic.Sigma(6, 1e-9)))

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.postgres import free_port
 
+from benchmarks.accuracy.postgres import free_port
 from umf_ros.absolute.measurement import AbsoluteReason, AbsoluteVerdict, Aid, write_verdicts
 from umf_ros.core.config import TerrainSettings, Verification
 from umf_ros.core.errors import ConfigError, OutputError

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -209,29 +209,31 @@ def bumpy(seconds: np.ndarray) -> np.ndarray:
     return np.stack([make_pose(turn, way) for turn, way in zip(turns, ways, strict=True)])
 
 
+def moved(starts: np.ndarray) -> Iterator[tuple[float, np.ndarray]]:
+    """Starts and the motion of the bumpy body in a quarter of a second from each."""
+    yield from zip(starts, np.linalg.inv(bumpy(starts)) @ bumpy(starts + 0.25), strict=True)
+
+
+BUMPY = Trajectory((np.arange(0, 60, 0.05) * 1e9).astype(np.int64), bumpy(np.arange(0, 60, 0.05)))
+
+
 @pytest.mark.parametrize("lag_s", [-0.6, 0.0, 0.35])
 def test_a_clock_that_is_off_is_found_whatever_the_mounting(lag_s: float) -> None:
-    seconds = np.arange(0, 60, 0.05)
-    odometry = Trajectory((seconds * 1e9).astype(np.int64), bumpy(seconds))
     mounted = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
-    starts = np.arange(5, 50, 0.25)
     steps = []
-    for start, earlier, later in zip(starts, bumpy(starts), bumpy(starts + 0.25), strict=True):
-        motion = np.linalg.inv(earlier) @ later
+    for start, motion in moved(np.arange(5, 50, 0.25)):
         turn = mounted.T @ Rotation.from_matrix(motion[:3, :3]).as_rotvec()
         steps.append(Step(*stamps(start - lag_s, start + 0.25 - lag_s), turn, mounted.T @ motion[:3, 3]))
-    found = compare_motion(steps, odometry)
+    found = compare_motion(steps, BUMPY)
     assert found is not None and found.lag_s == pytest.approx(lag_s) and found.mounting_deg is not None
     np.testing.assert_allclose(np.radians(found.mounting_deg), [0.1, -0.2, 0.3], atol=0.01)
-    few = compare_motion(steps[: MIN_PAIRS - 1], odometry)
+    few = compare_motion(steps[: MIN_PAIRS - 1], BUMPY)
     assert few is not None and few.lag_s is None and few.impossible, "more than 10 deg, by few pairs too"
 
 
 def test_motion_that_has_nothing_to_do_with_the_odometry_says_nothing(rng: np.random.Generator) -> None:
-    seconds = np.arange(0, 60, 0.05)
-    odometry = Trajectory((seconds * 1e9).astype(np.int64), bumpy(seconds))
     noise = [Step(*stamps(s, s + 0.25), rng.normal(0, 0.02, 3), rng.normal(0, 0.2, 3)) for s in np.arange(5, 50, 0.25)]
-    found = compare_motion(noise, odometry)
+    found = compare_motion(noise, BUMPY)
     assert found is not None and found.lag_s is None and not found.impossible
 
 
@@ -239,13 +241,9 @@ def test_motion_that_has_nothing_to_do_with_the_odometry_says_nothing(rng: np.ra
 def test_a_clock_is_right_until_the_motion_clearly_says_otherwise(seed: int) -> None:
     """Smooth motion under noise fits a little better at some other lag."""
     rng = np.random.default_rng(seed)
-    seconds = np.arange(0, 60, 0.05)
-    odometry = Trajectory((seconds * 1e9).astype(np.int64), bumpy(seconds))
-    starts = np.arange(5, 50, 0.6)
     steps = []
-    for start, earlier, later in zip(starts, bumpy(starts), bumpy(starts + 0.25), strict=True):
-        motion = np.linalg.inv(earlier) @ later
+    for start, motion in moved(np.arange(5, 50, 0.6)):
         turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec() + rng.normal(0, 0.01, 3)
         steps.append(Step(*stamps(start - 0.08, start + 0.17), turn, motion[:3, 3]))
-    found = compare_motion(steps, odometry)
+    found = compare_motion(steps, BUMPY)
     assert found is not None and not found.lag_s and not found.impossible

@@ -1,27 +1,19 @@
 from __future__ import annotations
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from recordings import CALIBRATION, CLOUD, START_NS, cloud, odometry, scan
+from recordings import CLOUD, START_NS, cloud, odometry, scan
 from scipy.spatial.transform import Rotation
 
 from umf_ros.core.config import FrameIds, Sync, Topics
 from umf_ros.core.errors import MessageError
 from umf_ros.core.geometry import Array, make_pose
-from umf_ros.sensors.calibration import Calibration, load_calibration
+from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.router import MessageRouter
 from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.sensors.tf import BodyFrames, StaticTransforms
-
-
-@pytest.fixture
-def calibration(tmp_path: Path) -> Calibration:
-    path = tmp_path / "calibration.yaml"
-    path.write_text(CALIBRATION)
-    return load_calibration(path)
 
 
 def stamped(parent: str, child: str, pose: Array) -> SimpleNamespace:

@@ -13,14 +13,26 @@ import recordings
 import yaml
 from command_line import only_line, umf
 from foreign_messages import HESAI, OUSTER, VELODYNE, compressed, drive, livox, relaid
-from recordings import CLOUD, LEFT, ODOMETRY, RIGHT, START_NS, Entry, camera_info, header, image, make, traverse
+from recordings import (
+    CLOUD,
+    LEFT,
+    ODOMETRY,
+    RIGHT,
+    START_NS,
+    Entry,
+    camera_info,
+    image,
+    make,
+    transform,
+    traverse,
+)
 
 from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import message_types, open_bag
 from umf_ros.core.config import load_settings
 from umf_ros.core.errors import BagError
-from umf_ros.core.geometry import make_pose, to_quaternion
+from umf_ros.core.geometry import make_pose
 from umf_ros.sensors.calibration import load_calibration
 
 
@@ -96,21 +108,6 @@ def test_what_could_find_nothing_ends_with_3(
     ended = umf("inspect", write(tmp_path / "bag.mcap", entries, monkeypatch))
     assert said in ended.text, ended.text
     assert ended.status == 3 and "Not usable for loop closure: " in ended.text
-
-
-def transform(parent: str, child: str, pose: np.ndarray) -> Any:
-    x, y, z = map(float, pose[:3, 3])
-    turn = dict(zip("xyzw", map(float, to_quaternion(pose)), strict=True))
-    return make(
-        "geometry_msgs/msg/TransformStamped",
-        header=header(START_NS, parent),
-        child_frame_id=child,
-        transform=make(
-            "geometry_msgs/msg/Transform",
-            translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-            rotation=make("geometry_msgs/msg/Quaternion", **turn),
-        ),
-    )
 
 
 def test_camera_info_and_transforms_become_the_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

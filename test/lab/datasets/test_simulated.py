@@ -65,11 +65,13 @@ def test_files_that_only_look_like_shards(tmp_path: Path) -> None:
         np.save(stream, np.zeros(3))
     with pytest.raises(UmfError, match="a single array"):
         SimulatedWorld(path)
-    for content in (whole[: len(whole) // 2], whole[:-30], b"x" * 500, whole[:1000] + b"\0" * 2000 + whole[3000:]):
+    for content in (whole[: len(whole) // 2], whole[:-30], b"x" * 500, whole[:1000] + b"\0" * 2000 + whole[3000:], b""):
         path.write_bytes(content)
         with pytest.raises(UmfError, match="cannot read") as raised:
             SimulatedWorld(path)
         assert "\n" not in str(raised.value)
+    with pytest.raises(UmfError, match="does not exist"):
+        SimulatedWorld(tmp_path / "none.npz")
 
 
 def test_objects_in_a_shard_are_not_unpickled(tmp_path: Path) -> None:

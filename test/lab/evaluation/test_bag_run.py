@@ -132,7 +132,8 @@ def test_a_truth_of_another_time_is_an_error(settings: Settings) -> None:
 
 def test_results_are_written(settings: Settings, tmp_path: Path) -> None:
     result = evaluate(settings, Confused(), truth())
-    report = result.write(tmp_path, ["a note"])
+    report = result.report(["a note"])
+    report.write(tmp_path)
     assert json.loads((tmp_path / "evaluation.json").read_text()) == result.figures() == report.figures
     text = (tmp_path / "evaluation.md").read_text()
     assert "superfeatures lidar" in text and "a note" in text and (tmp_path / "recall.png").stat().st_size > 5000

@@ -5,17 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import typer
 from recordings import ODOMETRY, TRUTH, small_settings, traverse, write_mcap
-from tiny_worlds import TINY, pose_at, world_arrays
+from tiny_worlds import pose_at, world_arrays
 from typer.testing import CliRunner
 
 from umf_ros.core.config import dump_settings
 from umf_ros.core.errors import ConfigError, UmfError
 from umf_ros.lab.commands import evaluate
-from umf_ros.lab.training.networks import save_weights
-from umf_ros.networks.umf import UMF
 
 app = typer.Typer()
 app.callback()(lambda: None)  # so that the name of its command is read
@@ -80,13 +77,6 @@ def write_worlds(folder: Path, **changes: np.ndarray) -> Path:
     np.savez(folder / "world_00001.npz", **(world_arrays() | changes))
     (folder / "data.yaml").write_text("- worlds: .\n")
     return folder / "data.yaml"
-
-
-@pytest.fixture
-def weights(tmp_path: Path) -> Path:
-    torch.manual_seed(0)
-    save_weights(UMF(TINY), tmp_path / "tiny.safetensors", {})
-    return tmp_path / "tiny.safetensors"
 
 
 def test_listed_sequences(tmp_path: Path, weights: Path) -> None:

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import typer
 from landmarks import CONFUSED, PLACES, LandmarkEmbedder, LineWorld
 from recordings import small_settings, traverse, write_mcap
-from tiny_worlds import TINY, world_arrays
+from tiny_worlds import world_arrays
 from typer.testing import CliRunner
 
 from umf_ros.bags.frames import FrameReader
@@ -24,9 +23,8 @@ from umf_ros.lab.evaluation import methods_run as all_methods
 from umf_ros.lab.evaluation.bag_run import drive_sets, recording_set, world_set
 from umf_ros.lab.evaluation.methods import FIGURES, bootstrap
 from umf_ros.lab.evaluation.methods_run import MethodsRun, compare_methods, make_others, search_ms
+from umf_ros.lab.evaluation.results import CAPTIONS
 from umf_ros.lab.evaluation.worlds import FIRST
-from umf_ros.lab.training.networks import save_weights
-from umf_ros.networks.umf import UMF
 
 PUBLISHED = "recall1 recall1_low recall1_high recall5 top1percent auc_pr recall_at_precision1 parameters"
 PUBLISHED += " extract_ms match_ms bytes"
@@ -39,13 +37,6 @@ class DrivenLine(LineWorld):
 
     def driven(self, wanted: tuple[int, ...]):  # type: ignore[no-untyped-def]
         return (visit for visit in self if visit.pass_index in wanted)
-
-
-@pytest.fixture
-def weights(tmp_path: Path) -> Path:
-    torch.manual_seed(0)
-    save_weights(UMF(TINY), tmp_path / "tiny.safetensors", {})
-    return tmp_path / "tiny.safetensors"
 
 
 def test_the_interval_holds_the_mean_and_narrows_with_queries() -> None:
@@ -67,7 +58,8 @@ def test_umf_its_rerankers_and_the_others_stand_in_one_table(
     monkeypatch.setattr(methods_run, "make_embedder", lambda *a, **k: LandmarkEmbedder() if a else made(*a, **k))
     run = MethodsRun(weights, {"thumbnail": LandmarkEmbedder()})
     run.add(world_set(DrivenLine()))  # type: ignore[arg-type]
-    report = run.write("All", ["a note"], tmp_path, repeats=1)
+    report = run.report(["a note"], repeats=1)
+    report.write(tmp_path)
     plain = 1 - len(CONFUSED) / PLACES
     assert report.figures["umf.recall1"] == report.figures["thumbnail.recall1"] == pytest.approx(plain, abs=1e-4)
     assert report.figures["umf_ransac.recall1"] == report.figures["umf_superfeatures.recall1"] == 1.0
@@ -81,7 +73,7 @@ def test_umf_its_rerankers_and_the_others_stand_in_one_table(
     text = (tmp_path / "evaluation.md").read_text()
     assert "a note" in text and "| umf_ransac | both | 100.0 | 100.0-100.0 |" in text
     assert "| ransac both | 100.0 |" in text and "39,385,229" in text
-    for picture in methods_run.PICTURES.values():
+    for picture in CAPTIONS:
         assert (tmp_path / picture).stat().st_size > 5000
 
 
@@ -101,12 +93,13 @@ def test_where_no_place_is_seen_twice_nothing_is_asked(
     monkeypatch.setattr(methods_run, "make_embedder", lambda *a, **k: LandmarkEmbedder() if a else made(*a, **k))
     monkeypatch.setattr(all_methods, "make_others", lambda trained: ({}, []))
     once, line = (world_set(world()) for world in (DrivenOnce, DrivenLine))  # type: ignore[arg-type]
-    make = (lambda: tmp_path), 1, lambda what, done: None
-    report, _ = compare_methods([once, line], [], weights, None, *make)
+    how = 1, lambda what, done: None
+    report = compare_methods([once, line], [], weights, None, *how)
+    report.write(tmp_path)
     assert report.figures["umf.recall1"] == pytest.approx(1 - len(CONFUSED) / PLACES, abs=1e-4)
     assert "Not asked: once 0, where no place is seen twice" in (tmp_path / "evaluation.md").read_text()
     with pytest.raises(UmfError, match="no place is seen twice in once 0"):
-        compare_methods([world_set(DrivenOnce())], [], weights, None, *make)  # type: ignore[arg-type]
+        compare_methods([world_set(DrivenOnce())], [], weights, None, *how)  # type: ignore[arg-type]
 
 
 def test_methods_without_weights_are_told_and_left_out(tmp_path: Path) -> None:

@@ -2,19 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from tiny_worlds import poses
 
 from umf_ros.core.config import Loop
-from umf_ros.core.geometry import make_pose
 from umf_ros.lab.evaluation.results import score
 from umf_ros.lab.evaluation.retrieval import ROBOTCAR_RULE, loop_closure, place_recognition, rank, revisits
 
 GAPS = Loop(min_time_gap_s=20, min_travel_m=15)
-
-
-def poses(*places: tuple[float, float, float]) -> np.ndarray:
-    """Poses at x, y in metres and a heading in degrees."""
-    return np.stack([make_pose(Rotation.from_euler("z", h, degrees=True).as_matrix(), [x, y, 0]) for x, y, h in places])
 
 
 def test_later_passes_are_asked_for_the_first() -> None:

@@ -24,9 +24,8 @@ from umf_ros.lab.evaluation.results import (
 )
 
 TABLE = (["", "R@1", "R@5"], [["fused", "70.0", "75.0"], ["ransac both", "7.1", "-"]])
-REPORT = EvaluationReport(
-    "Title", ["first note", "second note"], {"recall": 0.7, "none": None}, {"Recall": TABLE}, {"A curve": "curve.png"}
-)
+NOTES, FIGURES = ["first note", "second note"], {"recall": 0.7, "none": None}
+REPORT = EvaluationReport("Title", NOTES, FIGURES, {"Recall": TABLE}, {}, {"methods.png": Path.touch})
 
 
 def test_a_report_in_markdown() -> None:
@@ -39,8 +38,8 @@ def test_a_report_in_markdown() -> None:
         "| --- | ---: | ---: |\n"
         "| fused | 70.0 | 75.0 |\n"
         "| ransac both | 7.1 | - |\n\n"
-        "## A curve\n\n"
-        "![A curve](curve.png)\n"
+        "## Recall@1 of all methods\n\n"
+        "![Recall@1 of all methods](methods.png)\n"
     )
 
 
@@ -59,7 +58,7 @@ def test_a_report_is_written_for_programs_and_for_people(tmp_path: Path) -> None
     REPORT.write(tmp_path)
     assert json.loads((tmp_path / "evaluation.json").read_text()) == {"recall": 0.7, "none": None}
     assert (tmp_path / "evaluation.md").read_text() == REPORT.markdown()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["evaluation.json", "evaluation.md"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["evaluation.json", "evaluation.md", "methods.png"]
 
 
 def test_a_report_is_shown_with_its_notes_and_its_place(tmp_path: Path) -> None:

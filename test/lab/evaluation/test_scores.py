@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from sklearn.metrics import average_precision_score, precision_recall_curve
+from tiny_worlds import poses
 
-from umf_ros.core.geometry import make_pose
 from umf_ros.lab.evaluation.results import precision_recall, recall_by_yaw, recall_curve, recall_top_percent, score
 from umf_ros.lab.evaluation.retrieval import place_recognition, rank
 
@@ -113,11 +112,6 @@ def test_recall_equals_brute_force(rng: np.random.Generator) -> None:
             allowed = [(-similarity[query, r], r) for r in range(23) if admissible[query, r]]
             found += any(positive[query, r] for _, r in sorted(allowed)[:n])
         assert curve[n - 1] == pytest.approx(found / 40)
-
-
-def poses(*places: tuple[float, float, float]) -> np.ndarray:
-    """Poses at x, y in metres and a heading in degrees."""
-    return np.stack([make_pose(Rotation.from_euler("z", h, degrees=True).as_matrix(), [x, y, 0]) for x, y, h in places])
 
 
 def test_revisits_in_the_opposite_direction_are_a_bin_of_their_own() -> None:

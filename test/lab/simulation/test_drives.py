@@ -26,14 +26,6 @@ def walker(seed: int = 0) -> Walker:
     return Walker(CIRCLE, np.random.default_rng(seed))
 
 
-def test_a_second_lap_is_labelled_an_offset_revisit_near_the_first():
-    route = walker().forward(251).forward(200, lateral_m=3).route(0)
-    assert [label for label, _, _ in route.legs()] == ["first", "offset"]
-    again = route.path[route.path_length > 260]
-    away = np.abs(np.linalg.norm(again, axis=1) - 40)
-    assert 0.5 < away.max() < 3.2
-
-
 def test_turning_back_drives_the_other_way():
     route = walker().forward(100).turn_back().forward(60).route(0)
     assert [label for label, _, _ in route.legs()] == ["first", "opposite"]

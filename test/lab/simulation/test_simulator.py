@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from umf_ros.core.errors import ConfigError, OutputError
-from umf_ros.lab.commands.simulate import command
 from umf_ros.lab.datasets.simulated import SimulatedWorld
 from umf_ros.lab.simulation.bag_writer import BagWriter
 from umf_ros.lab.simulation.camera import ahead
@@ -168,13 +167,6 @@ def test_a_full_disk_leaves_the_old_shard(tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert [file.name for file in tmp_path.iterdir()] == ["a.npz"]
     assert np.load(path)["a"].tolist() == [0, 1, 2]
-
-
-def test_shards_that_are_there_are_kept(tmp_path):
-    (tmp_path / "world_00000.npz").write_bytes(b"an earlier one")
-    (tmp_path / "world_00001.npz").write_bytes(b"another")
-    command(shards=tmp_path, worlds="0:2")
-    assert (tmp_path / "world_00000.npz").read_bytes() == b"an earlier one"
 
 
 def test_every_family_comes_in_both_settings():

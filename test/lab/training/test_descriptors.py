@@ -83,19 +83,6 @@ def test_the_loss_of_a_batch_falls(folder: Path, chosen: dict[str, str]) -> None
     assert losses[-1] < 0.95 * losses[0]
 
 
-def test_batches_grow_while_too_few_triplets_are_active(folder: Path) -> None:
-    settings = load_run(None, method="minkloc_visual", train=str(folder), loss="triplet", **QUICK)
-    kind = find_objective("minkloc_visual")
-    objective = kind(kind.make_network(settings), settings)
-    objective.finish_epoch({"active": 0.9})
-    assert objective.batch_size == 8
-    objective.finish_epoch({"active": 0.1})
-    assert objective.batch_size == 10
-    for _ in range(5):
-        objective.finish_epoch({"active": 0.1})
-    assert objective.batch_size == settings.batch_limit
-
-
 def test_a_resumed_run_repeats_an_uninterrupted_one(folder: Path, tmp_path: Path) -> None:
     chosen = QUICK | {"train": str(folder), "method": "pointnet2", "steps": 4}
     whole = train(load_run(None, **chosen), tmp_path / "whole", False, ignore)

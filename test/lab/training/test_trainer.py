@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_worlds import TINY, write_world
+from tiny_worlds import TINY
 
 from umf_ros.core.errors import ConfigError, UmfError, WeightsError
 from umf_ros.lab.datasets.sample import Rule
-from umf_ros.lab.datasets.simulated import SimulatedWorld, WorldFolder
+from umf_ros.lab.datasets.simulated import WorldFolder
 from umf_ros.lab.datasets.views import Augmentation, ViewMaker
 from umf_ros.lab.training.batches import BatchMaker, PairSampler, places_drawn
 from umf_ros.lab.training.metric_objective import MetricObjective, rule_of, validate
@@ -253,33 +253,6 @@ def test_validation_of_a_perfect_world(world):
     found = validate(UMF(TINY), [world])[world.name]
     # the passes of this world show the same images and scans
     assert found["fused"].recall1 == found["image"].recall1 == found["cloud"].recall1 == 1
-
-
-def test_new_worlds_are_picked_up(folder):
-    worlds = WorldFolder(folder)
-    assert len(worlds.refresh()) == 2
-    write_world(folder / "world_00003.npz", 3)
-    assert [world.name for world in worlds.refresh()][-1] == "world_00003"
-
-
-@pytest.mark.parametrize(
-    ("content", "word"), [(b"", "cannot read"), (b"PK\x03\x04 half a file", "cannot read")], ids=["empty", "truncated"]
-)
-def test_damaged_shards(tmp_path, content, word):
-    path = tmp_path / "w.npz"
-    path.write_bytes(content)
-    with pytest.raises(UmfError, match=word):
-        SimulatedWorld(path)
-
-
-def test_foreign_shards(tmp_path):
-    np.savez(tmp_path / "w.npz", images=np.zeros(3))
-    with pytest.raises(UmfError, match="points"):
-        SimulatedWorld(tmp_path / "w.npz")
-    with pytest.raises(UmfError, match="does not exist"):
-        SimulatedWorld(tmp_path / "none.npz")
-    with pytest.raises(UmfError, match="not a folder"):
-        WorldFolder(tmp_path / "none")
 
 
 def test_wrong_settings_and_missing_data(folder, tmp_path):

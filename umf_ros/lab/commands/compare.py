@@ -12,12 +12,13 @@ import typer
 
 from umf_ros.commands import recordings as options
 from umf_ros.core.errors import BagError, ConfigError, OutputError, UmfError, one_line, writing
+from umf_ros.lab.commands.report import moment_of, recording_of
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from umf_ros.lab.evaluation.comparison import Comparer, Pair, Row
-    from umf_ros.lab.evaluation.place_views import Moment, PlaceView
+    from umf_ros.lab.evaluation.place_views import PlaceView
 
 Image = Annotated[Path | None, typer.Option(help="Image file; needs --calibration.", show_default=False)]
 ViewName = Annotated[
@@ -182,7 +183,7 @@ def explain(
 
     A run folder stands for its recording, read with the parameters of the run.
     """
-    moments = [_moment(text) for text in (query, match)]
+    moments = [moment_of(text) for text in (query, match)]
     options.check_files(source, config)
 
     from rich.console import Console
@@ -219,18 +220,7 @@ def explain(
 
 def _of_run(folder: Path, config: Path | None) -> tuple[Path, Path]:
     """Return the recording and the parameter file of a run."""
-    from umf_ros.lab.commands.report import recording_of
-
     bag = recording_of(folder)
     if bag is None:
         raise UmfError(f"{folder}: its recording is unknown or was moved; name it in place of the folder")
     return bag, config or folder / "config.yaml"
-
-
-def _moment(text: str) -> Moment:
-    from umf_ros.lab.evaluation.place_views import parse_moment
-
-    try:
-        return parse_moment(text)
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from None

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from umf_ros.core.frames import Frame
     from umf_ros.core.trajectory import Trajectory
     from umf_ros.lab.evaluation.methods_run import FrameSet
-    from umf_ros.lab.evaluation.results import Figures
+    from umf_ros.lab.evaluation.results import EvaluationReport, Figures
     from umf_ros.lab.evaluation.worlds import TestWorld
 
 
@@ -42,48 +42,47 @@ if TYPE_CHECKING:
 class OpenRecording:
     """An open recording with its ground truth."""
 
+    bag: Path
     frames: Iterable[Frame]
     settings: Settings
     truth: Trajectory
     duration_s: float
 
 
-@dataclass(frozen=True)
-class RecordingOptions:
-    """Command line options for a recording."""
+def open_with_truth(
+    bag: Path,
+    config: ParameterSource,
+    chosen: tuple[str, str | None, Path | None],
+    files: tuple[Path | None, str, Path | None],
+) -> OpenRecording:
+    """Open a recording to evaluate.
 
-    bag: Path
-    config: ParameterSource
-    dataset: str
-    embedder: str | None
-    odometry: Path | None
-    odometry_frame: str
-    ground_truth: Path | None
+    Args:
+        bag: the recording.
+        config: parameters.
+        chosen: data set, embedder and weights.
+        files: odometry, its frame, and ground truth.
 
-    def open(self, console: Console, weights: Path | None) -> OpenRecording:
-        """Open the recording.
+    Raises:
+        ConfigError: wrong options, or there is no truth.
+        BagError: it cannot be read.
+    """
+    odometry, frame, truth_path = files
+    frame_of_odometry = check_odometry_options(odometry, frame)
 
-        Raises:
-            ConfigError: wrong options, or there is no truth.
-            BagError: it cannot be read.
-        """
-        frame_of_odometry = check_odometry_options(self.odometry, self.odometry_frame)
+    from rich.console import Console
 
-        from umf_ros.bags.frames import FrameReader
-        from umf_ros.bags.trajectories import read_ground_truth, read_odometry
-        from umf_ros.commands.console import WARNING
+    from umf_ros.bags.frames import FrameReader
+    from umf_ros.bags.trajectories import read_ground_truth, read_odometry
+    from umf_ros.commands.console import WARNING
 
-        recording, settings = open_recording(self.bag, self.config, self.dataset, self.embedder, weights)
-        truth = read_ground_truth(recording, self.ground_truth)
-        if truth is None:
-            raise ConfigError(f"{self.bag} holds no ground truth; name a file with --ground-truth")
-
-        def warn(text: str) -> None:
-            console.print(text, **WARNING)
-
-        path = read_odometry(self.odometry, frame_of_odometry, settings) if self.odometry else None
-        frames = FrameReader(recording, settings, path, warn=warn)
-        return OpenRecording(frames, settings, truth, recording.duration_s)
+    recording, settings = open_recording(bag, config, *chosen)
+    truth = read_ground_truth(recording, truth_path)
+    if truth is None:
+        raise ConfigError(f"{bag} holds no ground truth; name a file with --ground-truth")
+    path = read_odometry(odometry, frame_of_odometry, settings) if odometry else None
+    frames = FrameReader(recording, settings, path, warn=lambda text: Console().print(text, **WARNING))
+    return OpenRecording(bag, frames, settings, truth, recording.duration_s)
 
 
 def choose_worlds(name: str, seed: int | None, quick: bool, count: int) -> list[TestWorld]:
@@ -134,8 +133,6 @@ class EveryMethod:
 
     def worlds(self, name: str, seed: int | None, count: int) -> Figures:
         """Evaluate on simulated worlds, or on the simulated S3LI sequences of the thesis's test split."""
-        from rich.console import Console
-
         from umf_ros.lab.evaluation.bag_run import drive_sets, world_set
         from umf_ros.lab.evaluation.worlds import WORLDS
         from umf_ros.lab.simulation.world import TEST
@@ -148,24 +145,20 @@ class EveryMethod:
                 f"Simulated S3LI sequences of seed {first}, every {every}. sample: each is asked for its own past, "
                 "20 s and 15 m back; those without a true match can only be wrong. Nothing was trained on the others."
             )
-            return self._compare(Console(), drive_sets(first, every), note)
+            return self._compare(drive_sets(first, every), note)
         chosen = choose_worlds(name, seed, self.quick, count)
-        return self._compare(Console(), map(world_set, chosen), note_on_worlds(chosen, self.quick))
+        return self._compare(map(world_set, chosen), note_on_worlds(chosen, self.quick))
 
     def places(self, listing: Path) -> Figures:
         """Evaluate on sets of still images or scans."""
-        from rich.console import Console
-
         from umf_ros.lab.evaluation.bag_run import still_set
         from umf_ros.lab.evaluation.places import read_place_sets
 
         sets = map(still_set, read_place_sets(listing))
-        return self._compare(Console(), sets, f"{listing}: a match is true where the set says so.")
+        return self._compare(sets, f"{listing}: a match is true where the set says so.")
 
     def sequences(self, listing: Path, rule: str) -> Figures:
         """Evaluate on listed sequences."""
-        from rich.console import Console
-
         from umf_ros.lab.datasets.listed import SequenceList
         from umf_ros.lab.evaluation.bag_run import sequence_set
         from umf_ros.lab.evaluation.retrieval import RULES
@@ -174,29 +167,26 @@ class EveryMethod:
         note = (
             f"{listing}: samples with a true match in an earlier pass are asked for it; same place by the rule {rule}."
         )
-        return self._compare(Console(), sets, note)
+        return self._compare(sets, note)
 
-    def recording(self, options: RecordingOptions) -> Figures:
+    def recording(self, opened: OpenRecording) -> Figures:
         """Evaluate on the keyframes of a recording."""
-        from rich.console import Console
-
-        console = Console()
-        opened = options.open(console, None)
-
         from umf_ros.lab.evaluation.bag_run import recording_set
 
-        places = recording_set(options.bag.stem, opened.frames, opened.truth, opened.settings)
+        places = recording_set(opened.bag.stem, opened.frames, opened.truth, opened.settings)
         gaps = opened.settings.loop
         note = (
-            f"{options.bag}: every keyframe against those at least {gaps.min_time_gap_s:g} s older and "
+            f"{opened.bag}: every keyframe against those at least {gaps.min_time_gap_s:g} s older and "
             f"{gaps.min_travel_m:g} m back along the path; keyframes without a true match can only be wrong."
         )
-        return self._compare(console, [places], note)
+        return self._compare([places], note)
 
-    def _compare(self, console: Console, sets: Iterable[FrameSet], note: str) -> Figures:
-        from umf_ros.core.io import create_run_folder
+    def _compare(self, sets: Iterable[FrameSet], note: str) -> Figures:
+        from rich.console import Console
+
         from umf_ros.lab.evaluation.methods_run import compare_methods
 
+        console = Console()
         with progress_bar(console) as bar:
             task = bar.add_task("reading", total=None)
             done: list[int] = []
@@ -205,17 +195,8 @@ class EveryMethod:
                 done.append(frames)
                 bar.update(task, description=f"{what}, {sum(done)} frames")
 
-            report, folder = compare_methods(
-                sets,
-                [note],
-                self.weights,
-                self.trained,
-                lambda: create_run_folder(self.out, latest=False),
-                REPEATS,
-                show,
-            )
-        report.show(console, folder)
-        return report.figures
+            report = compare_methods(sets, [note], self.weights, self.trained, REPEATS, show)
+        return finish(report, self.out, console)
 
 
 Optional = typer.Option
@@ -269,8 +250,8 @@ def command(
     every = EveryMethod(weights, trained, quick, out) if methods == "all" else None
     if data is None:
         refuse_unused("simulated worlds", of_lists | of_recordings)
-        chosen = str(worlds), seed, count
-        figures = every.worlds(*chosen) if every else _on_worlds(*chosen, quick, weights, out)
+        asked = str(worlds), seed, count
+        figures = every.worlds(*asked) if every else _on_worlds(*asked, quick, weights, out)
     elif listed and lists_place_sets(data):
         allowed = () if every else ("--embedder", "--config", "--set")
         others = {name: value for name, value in of_recordings.items() if name not in allowed}
@@ -282,16 +263,12 @@ def command(
         figures = every.sequences(data, rule) if every else _on_sequences(data, rule, weights, out)
     else:
         refuse_unused("a recording", of_worlds | of_lists | ({"--embedder": embedder} if every else {}))
-        opened = RecordingOptions(
-            data, parameters(config, changes), dataset, embedder, odometry, odometry_frame, ground_truth
-        )
-        figures = every.recording(opened) if every else _on_recording(opened, weights, out)
-    if json_file is not None:
-        import json
+        chosen, files = (dataset, embedder, None if every else weights), (odometry, odometry_frame, ground_truth)
+        opened = open_with_truth(data, parameters(config, changes), chosen, files)
+        figures = every.recording(opened) if every else _on_recording(opened, out)
+    from umf_ros.lab.program import write_figures
 
-        from umf_ros.core.io import write_atomically
-
-        write_atomically(json_file, json.dumps(figures, indent=2) + "\n")
+    write_figures(json_file, figures)
 
 
 def lists_place_sets(listing: Path) -> bool:
@@ -319,10 +296,11 @@ def _check(data: Path | None, worlds: str | None, methods: str, trained: Path | 
 def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
-    from umf_ros.core.io import create_run_folder
-    from umf_ros.lab.evaluation.worlds import WorldsRun, work
+    from umf_ros.core.io import check_writable
+    from umf_ros.lab.evaluation.worlds import evaluate_worlds, work
 
     console = Console()
+    check_writable(out)
     chosen = choose_worlds(name, seed, quick, count)
     with progress_bar(console) as bar:
         task = bar.add_task("", total=sum(work(world) for world in chosen))
@@ -330,29 +308,21 @@ def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Pa
         def progress(what: str, done: int) -> None:
             bar.update(task, description=what, advance=done)
 
-        run = WorldsRun(weights, chosen, 3 if quick else 10, progress)
-        folder = create_run_folder(out, latest=False)
-        summary = run.run()
-        report = run.write(
-            summary, folder, [note_on_worlds(chosen, quick) + " Times are medians on this machine, as busy as it was."]
-        )
-    report.show(console, folder)
-    return report.figures
+        summary = evaluate_worlds(weights, chosen, 3 if quick else 10, progress)
+    note = note_on_worlds(chosen, quick) + " Times are medians on this machine, as busy as it was."
+    return finish(summary.report([note]), out, console)
 
 
-def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) -> Figures:
+def _on_recording(opened: OpenRecording, out: Path) -> Figures:
     from rich.console import Console
 
-    console = Console()
-    opened = options.open(console, weights)
-
-    from umf_ros.core.io import create_run_folder
+    from umf_ros.core.io import check_writable
     from umf_ros.embedding import make_embedder
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
 
-    settings, bag = opened.settings, options.bag
+    check_writable(out)
+    console, settings = Console(), opened.settings
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, True, settings.verification.features))
-    folder = create_run_folder(out, latest=False)
     with progress_bar(console) as bar:
         task = bar.add_task("embedding", total=opened.duration_s)
         start_ns: list[int] = []
@@ -366,21 +336,18 @@ def _on_recording(options: RecordingOptions, weights: Path | None, out: Path) ->
         bar.update(task, description="reranking")
         result = evaluation.judge(opened.truth)
     notes = [
-        f"{bag}: every keyframe against those at least {settings.loop.min_time_gap_s:g} s older and "
+        f"{opened.bag}: every keyframe against those at least {settings.loop.min_time_gap_s:g} s older and "
         f"{settings.loop.min_travel_m:g} m back along the path. {result.keyframes} keyframes with a true pose, "
         f"{result.scores['fused'].queries} of them revisits; the others can only be wrong."
     ]
     if not opened.truth.has_orientation:
         notes.append("The truth has no headings: a match is true within 12 m, whatever its heading.")
-    report = result.write(folder, notes)
-    report.show(console, folder)
-    return report.figures
+    return finish(result.report(notes), out, console)
 
 
 def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
-    from umf_ros.core.io import create_run_folder
     from umf_ros.lab.datasets.listed import SequenceList
     from umf_ros.lab.evaluation.results import EvaluationReport
     from umf_ros.lab.evaluation.retrieval import RULES
@@ -393,15 +360,11 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     results = validate(network, SequenceList(listing).worlds, rule=RULES[rule])
     if not answerable(results):
         raise ConfigError(f"{listing}: no place is visited twice")
-    folder = create_run_folder(out, latest=False)
     notes = [
         f"{listing}: samples with a true match in an earlier pass are asked for it; same place by the rule {rule}."
     ]
     tables = {"Place recognition by the global descriptor": table(results)}
-    report = EvaluationReport("Evaluation on sequences", notes, means(results), tables)
-    report.write(folder)
-    report.show(console, folder)
-    return report.figures
+    return finish(EvaluationReport("Evaluation on sequences", notes, means(results), tables), out, console)
 
 
 def _on_places(
@@ -410,7 +373,6 @@ def _on_places(
     from rich.console import Console
 
     from umf_ros.core.config import load_settings
-    from umf_ros.core.io import create_run_folder
     from umf_ros.lab.evaluation.places import evaluate_place_sets
 
     console = Console()
@@ -418,6 +380,13 @@ def _on_places(
     settings = load_settings(config, **chosen)
     with console.status("embedding") as status:
         report = evaluate_place_sets(listing, settings, status.update)
+    return finish(report, out, console)
+
+
+def finish(report: EvaluationReport, out: Path, console: Console) -> Figures:
+    """Write a report into a folder of its own, print it, and return its figures."""
+    from umf_ros.core.io import create_run_folder
+
     folder = create_run_folder(out, latest=False)
     report.write(folder)
     report.show(console, folder)

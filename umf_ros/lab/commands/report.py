@@ -109,7 +109,7 @@ def why(
     a stamp, it lists the stages that rejected keyframes, those with most of them first.
     """
     check_run(folder)
-    asked = None if moment is None else _moment(moment)
+    asked = None if moment is None else moment_of(moment)
 
     from rich.console import Console
 
@@ -142,7 +142,8 @@ def why(
     _tell(console, about, row, explain(about, row))
 
 
-def _moment(text: str) -> int | float:
+def moment_of(text: str) -> int | float:
+    """Return a stamp in ns, or seconds from the start."""
     from umf_ros.lab.evaluation.place_views import parse_moment
 
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -25,8 +24,6 @@ from umf_ros.lab.evaluation.results import (
     EvaluationReport,
     Figures,
     Scores,
-    plot_precision_recall,
-    plot_recall,
     rounded,
     score,
     scores_table,
@@ -40,6 +37,7 @@ from umf_ros.lab.evaluation.retrieval import (
     rerank_all,
     revisits,
 )
+from umf_ros.lab.evaluation.summary import DRAWN
 from umf_ros.lab.evaluation.worlds import FIRST, REVISIT, TestWorld, visit_of
 from umf_ros.lab.simulation.camera import resized
 from umf_ros.lab.simulation.presets import etna_surveys
@@ -152,10 +150,6 @@ def _frame(sequence: SampleSequence, index: int) -> Frame:
     )
 
 
-PICTURES = {"Precision and recall": "precision_recall.png", "Recall": "recall.png"}
-SHOWN = ("fused", "superfeatures both", "ransac both")
-
-
 @dataclass(frozen=True, slots=True)
 class BagResult:
     """How well a recording's own past is recognised.
@@ -172,22 +166,14 @@ class BagResult:
         """The figures of the descriptor alone, and recall@1 of the rerankers."""
         found = self.scores["fused"]
         values = {name.replace("within_5m", "within5m"): getattr(found, name) for name in HEADINGS}
-        values |= {f"recall1_{name.split()[0]}": self.scores[name].recall1 for name in SHOWN[1:] if name in self.scores}
+        values |= {f"recall1_{name.split()[0]}": self.scores[name].recall1 for name in DRAWN[1:] if name in self.scores}
         return {"keyframes": self.keyframes, "queries": found.queries} | rounded(values)
 
-    def write(self, folder: Path, notes: list[str]) -> EvaluationReport:
-        """Write the table, the figures and the curves.
-
-        Raises:
-            OutputError: the folder cannot be written.
-        """
-        shown = {name: self.scores[name] for name in SHOWN if name in self.scores}
-        plot_precision_recall(folder / "precision_recall.png", {name: [found.curve] for name, found in shown.items()})
-        plot_recall(folder / "recall.png", {name: found.recalls for name, found in shown.items()}, "candidates")
+    def report(self, notes: list[str]) -> EvaluationReport:
+        """Figures, table and curves."""
+        shown = {name: [self.scores[name]] for name in DRAWN if name in self.scores}
         tables = {"Loop-closure protocol": scores_table({name: [found] for name, found in self.scores.items()})}
-        report = EvaluationReport("Evaluation on a recording", notes, self.figures(), tables, PICTURES)
-        report.write(folder)
-        return report
+        return EvaluationReport("Evaluation on a recording", notes, self.figures(), tables, shown)
 
 
 class BagEvaluation:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from umf_ros.lab.evaluation.methods import (
     plot_methods,
     sets_table,
 )
-from umf_ros.lab.evaluation.results import EvaluationReport, TextTable, percent, plot_precision_recall, plot_recall
+from umf_ros.lab.evaluation.results import EvaluationReport, TextTable, percent
 from umf_ros.lab.evaluation.retrieval import (
     METHODS,
     PairInliers,
@@ -49,11 +50,6 @@ PLACES = 858
 """In the database when matching is timed, as in [UMF table 5.9]."""
 TIMED_FRAMES = 6
 CURVES = ("umf_ransac", "umf_superfeatures", "umf", "adafusion", "minkloc_fusion", "netvlad")
-PICTURES = {
-    "Recall@1 of all methods": "methods.png",
-    "Precision and recall (figure 5.13)": "precision_recall.png",
-    "Recall among the first candidates": "recall.png",
-}
 
 
 @dataclass(frozen=True)
@@ -216,22 +212,10 @@ class MethodsRun:
         parts = (embedding.super_image, embedding.super_cloud) if of_supers else (embedding.image, embedding.cloud)
         return sum(size_of(part) for part in parts if part is not None)
 
-    def write(self, title: str, notes: list[str], folder: Path, repeats: int) -> EvaluationReport:
-        """Write tables, figures and pictures.
-
-        Raises:
-            OutputError: the folder cannot be written.
-        """
+    def report(self, notes: list[str], repeats: int) -> EvaluationReport:
+        """Tables, figures and pictures, with the times taken now."""
         results = self.results(repeats)
-        self._report("drawing", 0)
         by_name = {found.name: found for found in results}
-        shown = {name: list(by_name[name].sets.values()) for name in CURVES if name in by_name}
-        plot_methods(folder / "methods.png", results)
-        plot_precision_recall(
-            folder / "precision_recall.png", {name: [one.scores.curve for one in each] for name, each in shown.items()}
-        )
-        recalls = {name: np.mean([one.scores.recalls for one in each], axis=0) for name, each in shown.items()}
-        plot_recall(folder / "recall.png", recalls, "candidates")
         tables = {
             "Place recognition by all methods (as UMF table 5.4)": methods_table(results),
             "Recall@1 by set": sets_table(results),
@@ -239,9 +223,9 @@ class MethodsRun:
             "Cost (as UMF table 5.9)": costs_table(results),
         }
         figures = {name: value for found in results for name, value in found.figures().items()}
-        report = EvaluationReport(title, notes, figures, tables, PICTURES)
-        report.write(folder)
-        return report
+        shown = {name: [one.scores for one in by_name[name].sets.values()] for name in CURVES if name in by_name}
+        drawn = {"methods.png": partial(plot_methods, results=results)}
+        return EvaluationReport(TITLE, notes, figures, tables, shown, drawn)
 
     def _rerankers(self, plain: MethodResult) -> TextTable:
         rows = {"fused": list(plain.sets.values())} | self._reranked
@@ -283,10 +267,9 @@ def compare_methods(
     notes: list[str],
     weights: Path | None,
     trained: Path | None,
-    make_folder: Callable[[], Path],
     repeats: int,
     report: Callable[[str, int], None],
-) -> tuple[EvaluationReport, Path]:
+) -> EvaluationReport:
     """Ask all sets by all methods.
 
     Args:
@@ -294,7 +277,6 @@ def compare_methods(
         notes: of the sets, for the report.
         weights: of UMF; None: the default.
         trained: folder with the weights of other methods; None: the shipped ones.
-        make_folder: makes the folder to write to, once everything else has worked.
         repeats: how often each frame is embedded when time is taken.
         report: called with the name of what is worked on, and 1 for every frame done.
 
@@ -306,7 +288,6 @@ def compare_methods(
     asked = {places.name: run.add(places) for places in sets}
     if not any(asked.values()):
         raise UmfError(f"no place is seen twice in {', '.join(asked)}, so that nothing can be asked")
-    folder = make_folder()
     said = [
         "Intervals: queries drawn anew within each set, 1000 times. Matching: the best of 858 places, then 20 of them "
         "again by local features where a reranker is named. R@1 + XFeat: UMF's default features of images rerank the "
@@ -314,4 +295,4 @@ def compare_methods(
     ]
     said += [f"Not asked: {name}, where no place is seen twice in one direction." for name in asked if not asked[name]]
     said += [f"Not compared: {line}." for line in missing]
-    return run.write(TITLE, [*notes, *said], folder, repeats), folder
+    return run.report([*notes, *said], repeats)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -209,6 +209,11 @@ HEADINGS = {
 }
 """The figures of merit that tables show, and what they are called there."""
 
+CAPTIONS = {
+    "methods.png": "Recall@1 of all methods",
+    "precision_recall.png": "Precision and recall (figure 5.13)",
+    "recall.png": "Recall among the first candidates",
+}
 COLOURS = ("#1f6fb4", "#e07b00", "#2ca02c", "#7f5fb0", "#8c564b", "#777777")
 
 
@@ -221,21 +226,25 @@ class EvaluationReport:
         notes: paragraphs above the tables.
         figures: for programs.
         tables: by title.
-        pictures: names of files beside the report, by caption.
+        curves: scores in every world, by name, whose precision and recall are drawn.
+        pictures: further ones by name of the file; draws it.
     """
 
     title: str
     notes: Sequence[str]
     figures: Figures
     tables: Mapping[str, TextTable]
-    pictures: Mapping[str, str] = field(default_factory=dict)
+    curves: Mapping[str, Sequence[Scores]] = field(default_factory=dict)
+    pictures: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:
-        """Write evaluation.json and evaluation.md.
+        """Write evaluation.json and evaluation.md, and draw the pictures.
 
         Raises:
             OutputError: the folder cannot be written.
         """
+        for name, draw in self._drawn().items():
+            draw(folder / name)
         write_atomically(folder / "evaluation.json", json.dumps(self.figures, indent=2) + "\n")
         write_atomically(folder / "evaluation.md", self.markdown())
 
@@ -246,8 +255,20 @@ class EvaluationReport:
             align = ["---", *["---:"] * (len(head) - 1)]
             lines = [f"| {' | '.join(cells)} |" for cells in [head, align, *rows]]
             parts += [f"## {name}", "\n".join(lines)]
-        parts += [f"## {caption}\n\n![{caption}]({file})" for caption, file in self.pictures.items()]
+        captions = [(CAPTIONS[file], file) for file in self._drawn()]
+        parts += [f"## {caption}\n\n![{caption}]({file})" for caption, file in captions]
         return "\n\n".join(parts) + "\n"
+
+    def _drawn(self) -> dict[str, Callable[[Path], None]]:
+        """Every picture: draws it, by name of the file."""
+        if not self.curves:
+            return dict(self.pictures)
+        precision = {name: [one.curve for one in each] for name, each in self.curves.items()}
+        recall = {name: np.mean([one.recalls for one in each], axis=0) for name, each in self.curves.items()}
+        return dict(self.pictures) | {
+            "precision_recall.png": lambda path: plot_precision_recall(path, precision),
+            "recall.png": lambda path: plot_recall(path, recall, "candidates"),
+        }
 
     def show(self, console: Console, folder: Path) -> None:
         """Print tables and notes, and where the report lies."""

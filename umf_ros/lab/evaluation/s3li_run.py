@@ -21,7 +21,6 @@ import yaml
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_odometry, read_rtklib
@@ -30,7 +29,6 @@ from umf_ros.core.errors import UmfError, one_line
 from umf_ros.core.geometry import Array, heading
 from umf_ros.core.io import read_values, write_atomically
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.embedding import make_embedder
 from umf_ros.lab.datasets.s3li import ETNA_TEST, headed, load_data_frame, read_toolkit
 from umf_ros.lab.datasets.s3li_folder import (
@@ -49,14 +47,12 @@ from umf_ros.lab.evaluation.results import TextTable
 from umf_ros.lab.evaluation.retrieval import THESIS_RULE, Mask, loop_closure, rank
 from umf_ros.lab.imported import write_recording
 from umf_ros.lab.importing import FORMATS
+from umf_ros.lab.program import replay
 from umf_ros.lab.simulation.twin_files import LEAST_OVERLAP, view_overlap
-from umf_ros.replay import Replay
 from umf_ros.runs.findings import look_first
-from umf_ros.runs.reader import FinishedRun, read_run, remember_recording
+from umf_ros.runs.reader import read_run
 from umf_ros.runs.truth import JudgedRun, clock_offset, find_revisits, judge_run
-from umf_ros.runs.writer import count_drops
 from umf_ros.sensors.calibration import calibration_of
-from umf_ros.sensors.sensor_check import SensorCheck
 
 Record = dict[str, Any]
 """Figures of one sequence, or of several; None for what could not be measured."""
@@ -134,7 +130,8 @@ def replay_sequence(one: S3liSequence, folder: Path) -> Record:
     folder.mkdir(parents=True, exist_ok=True)
     notes: list[str] = []
     recording, settings, odometry = _open(one, folder, notes)
-    run, check = _replayed(folder, recording, settings, odometry, notes)
+    detector, _ = replay(recording, settings, folder, odometry, warn=notes.append, report=_progress)
+    run, check = read_run(folder), detector.sensors
     found, truth = truth_of(one, recording.start_ns, recording.end_ns), None
     if found:
         truth = found[1]
@@ -183,20 +180,6 @@ def write_calibration(one: S3liSequence, folder: Path, notes: list[str]) -> Path
     path = folder / "calibration.yaml"
     write_atomically(path, yaml.safe_dump(values | files[0].entries(), sort_keys=False))
     return path
-
-
-def _replayed(
-    folder: Path, recording: Any, settings: Settings, odometry: Trajectory | None, notes: list[str]
-) -> tuple[FinishedRun, SensorCheck]:
-    detector = LoopDetector(settings, make_detector_embedder(settings))
-    replay = Replay(folder, settings, detector)
-    reader = FrameReader(recording, settings, odometry, warn=notes.append)
-    for _ in replay.run(reader.stream()):
-        _progress(reader.progress)
-    replay.finish(count_drops(reader.counters))
-    replay.raise_if_frames_failed()
-    remember_recording(folder, recording)
-    return read_run(folder), detector.sensors
 
 
 def judged_record(about: JudgedRun, odometry: Trajectory | None) -> Record:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -13,22 +14,19 @@ import numpy as np
 from mcap.reader import make_reader
 from rich.console import Console
 
-from umf_ros.bags.frames import FrameReader
 from umf_ros.bags.presets import settings_for
 from umf_ros.bags.reader import open_bag
 from umf_ros.bags.trajectories import read_ground_truth
 from umf_ros.core.config import ParameterSource
 from umf_ros.core.errors import UmfError
 from umf_ros.core.tasks import spread
-from umf_ros.detector import LoopDetector, make_detector_embedder
 from umf_ros.lab.evaluation.results import TextTable
-from umf_ros.replay import Replay
+from umf_ros.lab.program import replay
 from umf_ros.runs.findings import about_sensors, judge
-from umf_ros.runs.reader import read_run, remember_recording
+from umf_ros.runs.reader import read_run
 from umf_ros.runs.report import finish_run
 from umf_ros.runs.run_file import read_odometry_of
 from umf_ros.runs.truth import JudgedRun
-from umf_ros.runs.writer import count_drops
 from umf_ros.sensors.sensor_check import SensorReport
 
 _NOTHING = "/none"
@@ -81,17 +79,6 @@ class StretchScore:
     false: int
 
 
-@dataclass(frozen=True, slots=True)
-class SensorTask:
-    """A replay with some of the sensors: which (a name in `SENSORS`), of what, into which folder."""
-
-    name: str
-    bag: Path
-    config: ParameterSource
-    folder: Path
-    report: bool
-
-
 def stretches_of(bag: Path) -> list[Stretch]:
     """The stretches of a simulated recording where places are seen again, and all of it at the end."""
     recording = open_bag(bag)
@@ -113,29 +100,22 @@ def replay_all(
     Raises:
         UmfError: the recording cannot be read, or holds no ground truth.
     """
-    tasks = [SensorTask(name, bag, config, folder / name.replace(" ", "_"), report) for name in SENSORS]
-    spread(replay, tasks, workers, done=done)
+    folders = {name: folder / name.replace(" ", "_") for name in SENSORS}
+    spread(partial(replay_with, bag, config, report), list(folders.items()), workers, done=done)
     recording = open_bag(bag)
     truth = read_ground_truth(recording)
-    return {task.name: judge(read_run(task.folder, recording, truth), recording) for task in tasks}
+    return {name: judge(read_run(run, recording, truth), recording) for name, run in folders.items()}
 
 
-def replay(task: SensorTask) -> None:
-    """Replay with some of the sensors."""
-    recording = open_bag(task.bag)
-    settings = settings_for(recording, task.config, "auto", **SENSORS[task.name])
-    task.folder.mkdir(parents=True)
-    detector = LoopDetector(settings, make_detector_embedder(settings))
-    run = Replay(task.folder, settings, detector)
-    reader = FrameReader(recording, settings, None, warn=lambda text: None)
-    for _ in run.run(reader.stream()):
-        pass
-    run.finish(count_drops(reader.counters))
-    run.raise_if_frames_failed()
-    remember_recording(task.folder, recording)
-    if task.report:
-        finished = read_run(task.folder, recording, reader.ground_truth)
-        sensors = detector.sensors.report(read_odometry_of(task.folder))
+def replay_with(bag: Path, config: ParameterSource, report: bool, chosen: tuple[str, Path]) -> None:
+    """Replay with some of the sensors, a name in `SENSORS`, into a folder."""
+    (name, folder), recording = chosen, open_bag(bag)
+    settings = settings_for(recording, config, "auto", **SENSORS[name])
+    folder.mkdir(parents=True)
+    detector, reader = replay(recording, settings, folder)
+    if report:
+        finished = read_run(folder, recording, reader.ground_truth)
+        sensors = detector.sensors.report(read_odometry_of(folder))
         finish_run(finished, recording, Console(file=StringIO()), sensors)
 
 

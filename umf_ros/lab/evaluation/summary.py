@@ -16,13 +16,24 @@ from umf_ros.core.config import EmbeddingSettings
 from umf_ros.core.frames import Frame
 from umf_ros.embedding import Embedder
 from umf_ros.embedding.umf import UmfEmbedder
-from umf_ros.lab.evaluation.results import Figures, Scores, TextTable, YawBin, mean, percent, rounded, scores_table
+from umf_ros.lab.evaluation.results import (
+    EvaluationReport,
+    Figures,
+    Scores,
+    TextTable,
+    YawBin,
+    mean,
+    percent,
+    rounded,
+    scores_table,
+)
 from umf_ros.lab.evaluation.retrieval import METHODS, RERANKERS, TOP_K
 from umf_ros.networks.config import locate_weights
 from umf_ros.networks.weights import load_weights
 from umf_ros.sensors.calibration import load_calibration
 
 WARM_UP = 3
+DRAWN = ("fused", "superfeatures both", "ransac both")
 BY_WORDS = ("image, network", "words", "image", "cloud empty, network", "cloud empty", "fused", "fused, words")
 """Scores with and without words; "image" and "cloud empty" are those of the place database."""
 
@@ -97,6 +108,11 @@ class WorldsSummary:
 
     results: Sequence[WorldResult]
     cost: Cost
+
+    def report(self, notes: Sequence[str]) -> EvaluationReport:
+        """Figures, tables and curves."""
+        curves = {name: [result.scores[name] for result in self.results] for name in DRAWN}
+        return EvaluationReport("Evaluation on simulated worlds", notes, self.figures(), self.tables(), curves)
 
     def of(self, name: str, figure: str = "recall1") -> list[float]:
         """One figure of merit in every world."""

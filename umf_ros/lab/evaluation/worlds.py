@@ -13,15 +13,7 @@ from umf_ros.core.config import EmbeddingSettings, Verification
 from umf_ros.core.frames import WORDS_WEIGHT, Frame, ScanMotion
 from umf_ros.core.geometry import Array, evenly
 from umf_ros.embedding import Embedder, make_embedder
-from umf_ros.lab.evaluation.results import (
-    EvaluationReport,
-    Scores,
-    YawBin,
-    plot_precision_recall,
-    plot_recall,
-    recall_by_yaw,
-    score,
-)
+from umf_ros.lab.evaluation.results import Scores, YawBin, recall_by_yaw, score
 from umf_ros.lab.evaluation.retrieval import (
     METHODS,
     MODES,
@@ -179,12 +171,7 @@ ASKED = {
     "words": ("image", "image", 0.0, 1.0),
     "fused, words": ("fused", "fused", 1.0, WORDS_WEIGHT),
 }
-RERANKED = ("fused", "superfeatures both", "ransac both")
 TIMED_FRAMES = 8
-PICTURES = {
-    "Precision and recall (figure 5.13)": "precision_recall.png",
-    "Recall among the first candidates": "recall.png",
-}
 
 
 class WorldEvaluation:
@@ -269,8 +256,10 @@ class WorldEvaluation:
         return recall_by_yaw(*self._ranked((REVISIT, OPPOSITE)))
 
 
-class WorldsRun:
-    """Evaluates one network on some worlds and fills a results folder.
+def evaluate_worlds(
+    weights: Path | None, worlds: list[TestWorld], repeats: int, report: Callable[[str, int], None]
+) -> WorldsSummary:
+    """Drive through all worlds, then take times.
 
     Args:
         weights: safetensors file or name of shipped weights, or None for the default.
@@ -278,45 +267,16 @@ class WorldsRun:
         repeats: how often each frame is embedded when time is taken.
         report: called with the name of what is worked on, and 1 for every frame or query done.
     """
-
-    def __init__(
-        self, weights: Path | None, worlds: list[TestWorld], repeats: int, report: Callable[[str, int], None]
-    ) -> None:
-        self._weights = locate_weights(weights)
-        self._worlds, self._repeats, self._report = worlds, repeats, report
-        self._settings = Verification()
-        wanted = EmbeddingSettings(weights=str(self._weights))
-        self._embedder = make_embedder(wanted, super_features=True, features=self._settings.features)
-
-    def run(self) -> WorldsSummary:
-        """Drive through all worlds, then take times."""
-        results: list[WorldResult] = []
-        for world in self._worlds:
-            evaluation = WorldEvaluation(world, self._embedder, self._settings, lambda: self._report(world.name, 1))  # noqa: B023
-            results.append(evaluation.run())
-        self._report("taking times", 0)
-        frames = [at_full_size(frame) for frame in results[0].examples]
-        return WorldsSummary(results, cost_of_weights(self._weights, frames, self._repeats))
-
-    def write(self, summary: WorldsSummary, folder: Path, notes: list[str]) -> EvaluationReport:
-        """Write tables and figures.
-
-        Raises:
-            OutputError: the folder cannot be written.
-        """
-        self._report("drawing", 0)
-        self._draw(summary, folder)
-        title = "Evaluation on simulated worlds"
-        report = EvaluationReport(title, notes, summary.figures(), summary.tables(), PICTURES)
-        report.write(folder)
-        return report
-
-    def _draw(self, summary: WorldsSummary, folder: Path) -> None:
-        results = summary.results
-        curves = {name: [result.scores[name].curve for result in results] for name in RERANKED}
-        plot_precision_recall(folder / "precision_recall.png", curves)
-        recalls = {name: np.mean([result.scores[name].recalls for result in results], axis=0) for name in RERANKED}
-        plot_recall(folder / "recall.png", recalls, "candidates")
+    located, settings = locate_weights(weights), Verification()
+    wanted = EmbeddingSettings(weights=str(located))
+    embedder = make_embedder(wanted, super_features=True, features=settings.features)
+    results = []
+    for world in worlds:
+        evaluation = WorldEvaluation(world, embedder, settings, lambda: report(world.name, 1))  # noqa: B023
+        results.append(evaluation.run())
+    report("taking times", 0)
+    frames = [at_full_size(frame) for frame in results[0].examples]
+    return WorldsSummary(results, cost_of_weights(located, frames, repeats))
 
 
 def work(world: TestWorld) -> int:

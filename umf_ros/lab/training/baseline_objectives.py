@@ -6,7 +6,7 @@ layers that learn alone, within minutes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -51,16 +51,15 @@ class DescriptorObjective(Objective):
 
     settings_type: ClassVar[type[RunSettings]] = DescriptorSettings
     network: PlaceNetwork
+    state: ClassVar[tuple[str, ...]] = (*Objective.state, "untrained")
 
     def __init__(self, network: PlaceNetwork, settings: DescriptorSettings) -> None:
         super().__init__(network, settings)
-        self._settings = settings
         self._validation = open_source(Path(settings.validation)).refresh if settings.validation else list
         self._sequences: Sequence[SampleSequence] = []
         self._sampler: PairSampler | None = None
         kept = Path(settings.views) if settings.views else None
         self._views = PreparedViews(network.reads, network.trunk, settings.variants, settings.seed, kept)
-        self.batch_size, self.best, self.stale = settings.batch, -1.0, 0
         self.untrained: dict[str, float] = {}
 
     @classmethod
@@ -133,21 +132,14 @@ class DescriptorObjective(Objective):
         worst = similarity.masked_fill(~negative, -1.0).amax(1)
         return neighbourhood_components(similarity, positive, negative), (best < worst).float().mean()
 
-    def finish_epoch(self, losses: Mapping[str, float]) -> None:
-        """Let the batches of the triplet loss grow while too few triplets are active."""
-        settings = self._settings
-        if settings.loss == "triplet" and losses["active"] < settings.active_share:
-            self.batch_size = min(int(self.batch_size * settings.batch_growth) // 2 * 2, settings.batch_limit)
-
     def judge(self, step: int) -> Judgement:
         """Recall on the validation worlds."""
         self.settle()
         found = self.recalls()
-        better = not found or found["recall1"] > self.best
-        self.best = max(self.best, found.get("recall1", -1.0))
-        self.stale = 0 if better else self.stale + 1
-        stop = bool(self._settings.patience) and self.stale >= self._settings.patience
-        return Judgement(better, stop, found | {f"{name}_untrained": value for name, value in self.untrained.items()})
+        better = not found or self.improves(found["recall1"])
+        return Judgement(
+            better, self.exhausted, found | {f"{name}_untrained": value for name, value in self.untrained.items()}
+        )
 
     def card(self) -> dict[str, Any]:
         """How good it was before and is now."""
@@ -175,16 +167,6 @@ class DescriptorObjective(Objective):
             with torch.inference_mode():
                 parts.append(F.normalize(self.network(seen)["descriptor"].float(), dim=1).cpu())
         return torch.cat(parts).numpy()
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """For a checkpoint: what is not a weight."""
-        names = ("batch_size", "best", "stale", "untrained")
-        return {name: getattr(self, name) for name in names}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Inverse of `get_extra_state`."""
-        for name, value in state.items():
-            setattr(self, name, value)
 
 
 class NetVladObjective(DescriptorObjective):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -129,7 +129,6 @@ class MetricObjective(Objective):
         self, network: UMF, settings: MetricSettings, validation: Callable[[], Sequence[SampleSequence]] | None = None
     ) -> None:
         super().__init__(network, settings)
-        self._settings = settings
         if validation is None:
             validation = open_source(Path(settings.validation)).refresh if settings.validation else list
         self._validation = validation
@@ -139,8 +138,6 @@ class MetricObjective(Objective):
         self._sampler: tuple[int, PairSampler] | None = None
         self._results: Results = {}
         self.bank = Bank(settings.bank, network.config.length)
-        self.batch_size = settings.batch
-        self.best, self.stale = -1.0, 0
         _choose_parameters(network, settings)
         if settings.loss == "neighbourhood":
             _slow_statistics(network)
@@ -185,12 +182,6 @@ class MetricObjective(Objective):
             self.network.voxel_encoder.eval()
         return self
 
-    def finish_epoch(self, losses: Mapping[str, float]) -> None:
-        """Let the batches of the triplet loss grow while too few triplets are active."""
-        settings = self._settings
-        if settings.loss == "triplet" and losses["active"] < settings.active_share:
-            self.batch_size = min(int(self.batch_size * settings.batch_growth) // 2 * 2, settings.batch_limit)
-
     def judge(self, step: int) -> Judgement:
         """Recall on the validation sequences, where a validation is due."""
         settings = self._settings
@@ -203,18 +194,14 @@ class MetricObjective(Objective):
         recalls = {f"recall1_{mode}": mean_of(self._results, mode, "recall1") for mode in MODES}
         recalls["recall1_5m"] = mean_of(self._results, "fused", "recall1_within_5m")
         recalls["recall_at_precision1"] = mean_of(self._results, "fused", "recall_at_precision1")
-        stop = bool(settings.patience) and self.stale >= settings.patience
-        return Judgement(keep, stop, recalls | {"batch": self.batch_size})
+        return Judgement(keep, self.exhausted, recalls | {"batch": self.batch_size})
 
     def _is_best(self) -> bool:
         if not answerable(self._results):
             return True  # nothing to compare by: the latest is the best
         mode = "fused" if self._settings.branch == "both" else self._settings.branch
-        score = mean_of(self._results, mode, "recall1") + mean_of(self._results, mode, "recall1_within_5m")
-        better = score > self.best
-        self.stale = 0 if better else self.stale + 1
-        self.best = max(self.best, score)
-        return better
+        recalls = mean_of(self._results, mode, "recall1"), mean_of(self._results, mode, "recall1_within_5m")
+        return self.improves(sum(recalls))
 
     def card(self) -> dict[str, Any]:
         """The figures of the last validation."""
@@ -225,12 +212,12 @@ class MetricObjective(Objective):
 
     def get_extra_state(self) -> dict[str, Any]:
         """For a checkpoint: what is not a weight."""
-        return {"bank": self.bank.state(), "batch_size": self.batch_size, "best": self.best, "stale": self.stale}
+        return super().get_extra_state() | {"bank": self.bank.state()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Inverse of `get_extra_state`."""
-        self.bank.restore(state["bank"])
-        self.batch_size, self.best, self.stale = state["batch_size"], state["best"], state["stale"]
+        self.bank.restore(state.pop("bank"))
+        super().set_extra_state(state)
 
 
 def dropped(batch: NetworkInput, chance: float, rng: np.random.Generator) -> tuple[Tensor, Tensor]:

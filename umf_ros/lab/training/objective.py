@@ -140,10 +140,13 @@ class Objective(nn.Module, ABC):
 
     settings_type: ClassVar[type[RunSettings]]
     network: Any
+    state: ClassVar[tuple[str, ...]] = ("batch_size", "best", "stale")
+    """Attributes that a checkpoint holds beside the weights."""
 
     def __init__(self, network: nn.Module, settings: Any) -> None:
         super().__init__()
-        self.network = network
+        self.network, self._settings = network, settings
+        self.batch_size, self.best, self.stale = settings.batch, -1.0, 0
 
     @classmethod
     def make_network(cls, settings: Any) -> nn.Module:
@@ -177,15 +180,38 @@ class Objective(nn.Module, ABC):
         """Losses by name; "total" is what is minimised."""
 
     def finish_epoch(self, losses: Mapping[str, float]) -> None:
-        """Adapt to the mean losses of an epoch, in every process."""
+        """Let the batches of the triplet loss grow while too few triplets are active, in every process."""
+        settings = self._settings
+        if getattr(settings, "loss", "") == "triplet" and losses["active"] < settings.active_share:
+            self.batch_size = min(int(self.batch_size * settings.batch_growth) // 2 * 2, settings.batch_limit)
 
     def judge(self, step: int) -> Judgement:
         """How the network stands after `step` steps; asked after every epoch, in the leading process alone."""
         return Judgement()
 
+    def improves(self, score: float) -> bool:
+        """Whether a validation is the best so far; counts those that were not."""
+        better = score > self.best
+        self.best, self.stale = max(self.best, score), 0 if better else self.stale + 1
+        return better
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether as many validations as the settings have patience for were not the best."""
+        return bool(self._settings.patience) and self.stale >= self._settings.patience
+
     def card(self) -> dict[str, Any]:
         """Entries of the weights' card besides those of every card."""
         return {}
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """For a checkpoint: what is not a weight."""
+        return {name: getattr(self, name) for name in self.state}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Inverse of `get_extra_state`."""
+        for name, value in state.items():
+            setattr(self, name, value)
 
 
 def find_objective(method: str) -> type[Objective]:

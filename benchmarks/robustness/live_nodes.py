@@ -1,4 +1,4 @@
-"""The nodes as processes over DDS, for `endurance.py`: started, killed, heard."""
+"""The nodes as processes over DDS, for `endurance.py` and `latency.py`: started, killed, driven, heard."""
 
 from __future__ import annotations
 
@@ -7,24 +7,47 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 
-from umf_ros.nodes.conversions import CLOSURES_QOS, from_time
+from umf_ros.core.frames import LoopClosure
+from umf_ros.core.geometry import Array
+from umf_ros.lab.simulation.pose_graphs import PERIOD_NS, GraphWorld
+from umf_ros.nodes.conversions import CLOSURES_QOS, closure_to_message, from_time, to_pose, to_time
 from umf_ros.pose_graph.closures import ClosureReason
 
+Figures = dict[str, Any]
 FRONT_END, BACK_END = "loop_closure_node", "pose_graph_node"
 PLAYER = "umf_ros.lab.live.bag_player_node"
 START_S = 120.0
+MANY = QoSProfile(depth=500)
+DISCOVERY_S = 1.0
+"""The writer knows its reader before the reader knows it, and messages sent between are lost."""
 UNDECIDED = ClosureReason.NO_ODOMETRY_YET, ClosureReason.NOT_DECIDED_YET
+
+
+def spread(name: str, milliseconds: Array) -> Figures:
+    """Median, 95th percentile and worst of a cost."""
+    p50, p95, worst = np.percentile(milliseconds, [50, 95, 100]).round(1).tolist()
+    return {f"{name}_p50": p50, f"{name}_p95": p95, f"{name}_max": worst}
+
+
+def later(world: GraphWorld, row: int) -> LoopClosure:
+    """A closure of a world whose first pose has the stamp of one second, not zero."""
+    closure, told = world.closures[row], world.message(row)
+    stamps = (closure.second + 1) * PERIOD_NS, (closure.first + 1) * PERIOD_NS
+    return LoopClosure(*stamps, told.match_T_query, told.covariance)
 
 
 @contextmanager
@@ -90,9 +113,10 @@ class NodeUnderTest:
             status = -1
         return time.monotonic() - asked, status
 
-    def tracebacks(self) -> int:
-        """How many its log holds."""
-        return self.log.read_text(errors="replace").count("Traceback")
+    def end(self) -> tuple[float, int]:
+        """Stop it; seconds that took, and the number of tracebacks in its log and of a wrong exit status."""
+        seconds, status = self.stop()
+        return seconds, int(status != 0) + self.log.read_text(errors="replace").count("Traceback")
 
 
 def play(bag: Path, *more: str, moved_to: str = "", topics: tuple[str, ...] = ()) -> subprocess.Popen[bytes]:
@@ -101,6 +125,42 @@ def play(bag: Path, *more: str, moved_to: str = "", topics: tuple[str, ...] = ()
     command = [sys.executable, "-m", PLAYER, str(bag), "--quiet", "--wait-for-subscribers", *more]
     silent = subprocess.DEVNULL
     return subprocess.Popen([*command, *(["--ros-args", *words] if words else [])], stdout=silent, stderr=silent)
+
+
+@contextmanager
+def listening() -> Iterator[Ears]:
+    """Ears in a domain of their own."""
+    with own_domain():
+        ears = Ears()
+        yield ears
+        ears.destroy_node()
+
+
+class Rover:
+    """Odometry and front-end of a rover in a world, whose first pose has the stamp of one second."""
+
+    def __init__(self, ears: Ears, world: GraphWorld) -> None:
+        self._ears, self._world = ears, world
+        self.odometry = ears.create_publisher(Odometry, "/odom", MANY)
+        self._closures = ears.create_publisher(Odometry, "/loop_closures", CLOSURES_QOS)
+
+    def drive(self, poses: Iterable[int], close: bool = True) -> Iterator[list[LoopClosure]]:
+        """Publish odometry of some poses, and after each one the closures that end there, which are yielded."""
+        for k in poses:
+            message = Odometry(child_frame_id="base_link")
+            message.header.stamp, message.header.frame_id = to_time((k + 1) * PERIOD_NS), "odom"
+            message.pose.pose = to_pose(self._world.odometry[k])
+            self.odometry.publish(message)
+            rows = [row for row, closure in enumerate(self._world.closures) if closure.second == k and close]
+            closures = [later(self._world, row) for row in rows]
+            for closure in closures:
+                self.send(closure)
+            self._ears.spin_once(0.002)
+            yield closures
+
+    def send(self, closure: LoopClosure) -> None:
+        """Publish a closure."""
+        self._closures.publish(closure_to_message(closure))
 
 
 class Ears(Node):
