@@ -43,9 +43,8 @@ def written(about: JudgedRun, findings: list[Advice] | None = None) -> str:
 
 
 def scene_in(page: str) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
-    assert found
-    content: dict[str, Any] = json.loads(found[1])
+    (found,) = re.findall(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
+    content: dict[str, Any] = json.loads(found)
     return content
 
 
@@ -79,7 +78,8 @@ def test_every_closure_is_a_row_and_a_pair_with_its_number(tmp_path: Path) -> No
 
 
 def test_rows_link_to_their_pairs_and_every_bar_has_the_meaning_of_its_measurements(tmp_path: Path) -> None:
-    tested = [candidate(54, 14, RejectReason.IMPROBABLE, **BELOW), candidate(52, 12, None, **BELOW)]
+    infinite = candidate(52, 12, None, **(BELOW | {"residual_m": float("inf")}))
+    tested = [candidate(54, 14, RejectReason.IMPROBABLE, **BELOW), infinite]
     page = written(examined(tmp_path, [closure(50, 10), closure(52, 12)], tested, truth=trajectory(), missed=[54]))
     scene = scene_in(page)
     links = {int(number): int(pair) for pair, number in re.findall(r'<a href="#pair=(\d+)">(\d+)</a>', page)}
@@ -88,14 +88,14 @@ def test_rows_link_to_their_pairs_and_every_bar_has_the_meaning_of_its_measureme
     assert len(bars) >= 16 and all(scene["measurements"][name] for name, _ in bars)
     assert scene["measurements"]["tail_like_noise"]["noise_m"] == MEASUREMENTS["noise_m"]
     assert bars[0][1]["noise_m"] == BELOW["noise_m"]
+    assert {"residual_m" in values for _, values in bars} == {True, False}
 
 
 def test_pending_is_not_rejected(tmp_path: Path) -> None:
     about = examined(tmp_path, [closure(50, 10)], verdict=accepted(State.PENDING, ClosureReason.UNSURE))
     assert scene_in(written(about))["pairs"][0]["kind"] == "pending"
-    assert final_verdicts(about) == [
-        "closure 1, 40.0 s back: pending, needs support from another place (2.0 sigma, 0.10 m)"
-    ]
+    (line,) = final_verdicts(about)
+    assert line == "closure 1, 40.0 s back: pending, needs support from another place (2.0 sigma, 0.10 m)"
 
 
 def test_the_sweep_counts_what_a_threshold_would_publish(tmp_path: Path) -> None:

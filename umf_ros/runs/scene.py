@@ -117,7 +117,7 @@ def _details(about: JudgedRun, key: Endpoints, number: int) -> dict[str, Any]:
         names = sorted({*given, *lost} - {"bias"}, key=lambda name: -(given.get(name, 0) + lost.get(name, 0)))
         entry["bars"] = [[name, round(given.get(name, 0), 2), round(lost.get(name, 0), 2)] for name in names]
         entry["bias"] = round(given.get("bias", 0), 2)
-        entry["values"] = {name: float(f"{value:.3g}") for name, value in candidate.measurements.items()}
+        entry["values"] = {name: float(f"{x:.3g}") for name, x in candidate.measurements.items() if math.isfinite(x)}
     pose, source = (about.run.closures[number - 1].match_T_query, "the closure") if number else _pose(about, key)
     if pose is not None:
         entry["pose"] = [round(float(value), 4) for value in pose[:3].ravel()]

@@ -124,7 +124,7 @@ class ViewAlignment:
             share of its width and height.
         distance_m: median distance of the two points of a pair, where both depths are known; NaN without any.
         share: of the pairs with a depth, how many agree.
-        two_way_m: distance of the poses that the query's depths and the match's give, each by themselves; inf without.
+        two_way_m: distance of the poses that the query's depths and the match's give, each by themselves; NaN without.
     """
 
     pose: Array
@@ -253,7 +253,7 @@ class PairedViews:
 
     def _two_way_m(self) -> float:
         if self.forward is None or self.backward is None:
-            return float("inf")
+            return float("nan")
         return float(np.linalg.norm(relative(self.forward, self.backward)[:3, 3]))
 
     def _spread(self, agree: Mask) -> float:
