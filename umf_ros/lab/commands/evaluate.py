@@ -242,7 +242,9 @@ def command(
     listed = data is not None and data.suffix in (".yaml", ".yml")
     if data is not None and not listed:
         check_files(data, config, odometry, ground_truth)
+    from umf_ros.core.io import check_writable
 
+    check_writable(out)
     of_worlds: dict[str, object] = {"--seed": seed is not None, "--quick": quick, "--count": count != 4}
     of_lists: dict[str, object] = {"--rule": rule != "s3li"}
     of_recordings: dict[str, object] = {"--config": config, "--dataset": dataset != "auto", "--embedder": embedder}
@@ -296,11 +298,9 @@ def _check(data: Path | None, worlds: str | None, methods: str, trained: Path | 
 def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Path | None, out: Path) -> Figures:
     from rich.console import Console
 
-    from umf_ros.core.io import check_writable
     from umf_ros.lab.evaluation.worlds import evaluate_worlds, work
 
     console = Console()
-    check_writable(out)
     chosen = choose_worlds(name, seed, quick, count)
     with progress_bar(console) as bar:
         task = bar.add_task("", total=sum(work(world) for world in chosen))
@@ -316,11 +316,9 @@ def _on_worlds(name: str, seed: int | None, count: int, quick: bool, weights: Pa
 def _on_recording(opened: OpenRecording, out: Path) -> Figures:
     from rich.console import Console
 
-    from umf_ros.core.io import check_writable
     from umf_ros.embedding import make_embedder
     from umf_ros.lab.evaluation.bag_run import BagEvaluation
 
-    check_writable(out)
     console, settings = Console(), opened.settings
     evaluation = BagEvaluation(settings, make_embedder(settings.embedding, True, settings.verification.features))
     with progress_bar(console) as bar:
