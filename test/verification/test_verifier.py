@@ -21,6 +21,7 @@ from umf_ros.lab.simulation.scenes import landscape, pose_at, take, without_imag
 from umf_ros.sensors.decode import Cloud
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
 from umf_ros.verification import constants as const
+from umf_ros.verification import verifier as verifier_module
 from umf_ros.verification.hypothesis import SCAN
 from umf_ros.verification.pose_search import Fit, RotatedMaps, search
 from umf_ros.verification.prepared_scan import PreparedScan
@@ -330,6 +331,20 @@ def test_hypotheses_that_end_at_one_pose_are_judged_once(verifier: Verifier) -> 
     assert poses
     for number, pose in enumerate(poses):
         assert not any(near(pose, other, const.DISTINCT_M, const.DISTINCT_RAD) for other in poses[:number])
+
+
+def test_given_poses_are_judged_as_if_the_search_had_found_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    query, match = take(GROUND, HERE, 100.0), take(GROUND, THERE, 10.0)
+    found = Verifier(Verification()).examine(query, [candidate(match)])
+    rivals: list[list[Array]] = []
+    monkeypatch.setattr(verifier_module, "compare_elsewhere", lambda *given: rivals.append(given[-1]) or {})
+    away = TRUE @ make_pose(np.eye(3), [3.0, 5.0, 0.0])
+    here, wrong = Verifier(Verification()).examine(query, [candidate(match)], [TRUE, away])[len(found) :]
+    assert near(here.pose, TRUE, 0.05, 0.02) and not near(wrong.pose, TRUE, 1.0, 0.3)
+    # the right pose, which the search found, is a rival of the wrong one alone
+    beside_right, beside_wrong = rivals[-2:]
+    assert any(near(pose, TRUE, 0.05, 0.02) for pose in beside_wrong)
+    assert not any(near(pose, TRUE, 0.05, 0.02) for pose in beside_right)
 
 
 def rivals_known(verdicts: list[Hypothesis]) -> list[bool]:

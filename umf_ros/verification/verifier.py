@@ -104,10 +104,19 @@ class Verifier:
         missing = [one for one in candidates if one[0].index not in compared]
         return found + [Hypothesis.of(query, *one, reason=RejectReason.NOT_COMPARED) for one in missing]
 
-    def examine(self, query: Keyframe, candidates: Sequence[Offered]) -> list[Hypothesis]:
-        """Return all judged hypotheses about all candidates, without a decision: the examples of the fit."""
-        hypotheses = self._hypotheses(query, rerank(query, candidates, self._settings), self._turned(query))
-        examined = self._judge(hypotheses, 0.0)
+    def examine(self, query: Keyframe, candidates: Sequence[Offered], poses: Sequence[Array] = ()) -> list[Hypothesis]:
+        """Return all judged hypotheses about all candidates, without a decision: the examples of the fit.
+
+        Args:
+            query: the newest keyframe.
+            candidates: with their keyframes.
+            poses: (4, 4) `match_T_query` of the first candidate by its scan, each judged as if the search had found it
+                as well.
+        """
+        ranked = rerank(query, candidates, self._settings)
+        found = self._judge(self._hypotheses(query, ranked, self._turned(query)), 0.0)
+        offered = (Hypothesis.of(query, *ranked[0], pose=pose) for pose in poses)
+        examined = found + [judged for one in offered for judged in self._judge([one], 0.0, found)]
         first = {one.match_stamp_ns: one for one in reversed(examined)}
         self._memory.remember(query, [(one.keyframes[1], one.pose, False) for one in first.values()])
         return examined
@@ -163,12 +172,17 @@ class Verifier:
             found += find_hypotheses(query, candidate, keyframe, turned, scan, self._settings, guess)
         return sorted(found, key=lambda one: -one.score)
 
-    def _judge(self, hypotheses: list[Hypothesis], least: float) -> list[Hypothesis]:
+    def _judge(self, hypotheses: list[Hypothesis], least: float, known: Sequence[Hypothesis] = ()) -> list[Hypothesis]:
         """Align and measure the first hypotheses, and judge each beside the others about its candidate.
 
         The others are only aligned where one of these is promising: the right pose may be among them. The slow tests
         are left out where they cannot change the decision; of the hypotheses along one passage, the first stands for
         all.
+
+        Args:
+            hypotheses: the most promising first.
+            least: probability that a closure needs; with 0, no test is left out.
+            known: judged earlier, whose poses are rivals of these.
         """
         aligned = self._aligned(hypotheses[: const.MAX_REFINED], [])
         promising = [one.candidate for one in aligned if self._promises(one, least)]
@@ -182,12 +196,12 @@ class Verifier:
                 continue
             judged.append(one)
             if promises:
-                rivals = [other.pose for other in aligned if other.candidate is one.candidate]
+                rivals = [other.pose for other in (*known, *aligned) if other.candidate is one.candidate]
                 found = self._look_elsewhere(one, [pose for pose in rivals if not same_pose(pose, one.pose)])
                 passages += [(one, found)] if found else []
                 one.measurements |= excess_differences(one.scans[0], one.scans[1], one.pose)
             one.probability = self._probability(one)
-            if one.scans and self._objection(one) is None:
+            if one.scans and (not least or self._objection(one) is None):
                 one.measurements |= self._commonplace(one)
         for one, found in passages:  # those at another heading are rivals
             rivals = [other.pose for other, _ in passages if other is not one and other.candidate is one.candidate]

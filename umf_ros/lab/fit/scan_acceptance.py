@@ -36,14 +36,8 @@ from umf_ros.lab.simulation.scenes import TRAPS
 from umf_ros.lab.simulation.world import VALIDATION
 from umf_ros.places.database import PlaceDatabase
 from umf_ros.verification import Verifier
-from umf_ros.verification.acceptance import CRITERIA, AcceptanceModel, Logistic, Measurements, load_acceptance, refuted
-from umf_ros.verification.hypothesis import SCAN, SUBMAP, Hypothesis, same_pose
-from umf_ros.verification.measurement import measure
-from umf_ros.verification.passages import compare_elsewhere
-from umf_ros.verification.prepared_scan import PreparedScan
-from umf_ros.verification.rerank import rerank
-from umf_ros.verification.scan_alignment import align_scans
-from umf_ros.verification.scan_consistency import excess_differences
+from umf_ros.verification.acceptance import CRITERIA, AcceptanceModel, Logistic, load_acceptance, refuted
+from umf_ros.verification.hypothesis import SCAN, SUBMAP
 
 RIGHT_M, RIGHT_DEG = 0.3, 2.5
 WRONG_M, WRONG_DEG = 0.75, 4.0  # what lies between is neither
@@ -108,26 +102,21 @@ def _examples(tried: Tried, verifier: Verifier, domain: Domain, rng: np.random.G
     """Poses that verification finds, and its measurements at poses that it may find another time."""
     verifier.reset()
     candidates = [(Candidate(0, tried.match.stamp_ns, tried.pair.similarity), tried.match)]
-    examined = [one for one in verifier.examine(tried.query, candidates) if one.scans]
-    found = [(one.pose, one.measurements) for one in examined]
-    scans = PreparedScan.of(tried.match), PreparedScan.of(tried.query)
-    if all(scan.usable for scan in scans):
-        ranked, _ = rerank(tried.query, candidates, Verification())[0]
-        found += [
-            _aligned(tried, ranked, scans, guess, examined) for guess in _guesses(tried, domain.scanner.all_round, rng)
-        ]
+    usable = all(verifier.scans[keyframe].usable for keyframe in (tried.query, tried.match))
+    guesses = _guesses(tried, domain.scanner.all_round, rng) if usable else []
     kept: list[Array] = []
-    for pose, measurements in found:
-        right = tried.is_right(pose)
+    for one in verifier.examine(tried.query, candidates, guesses):
+        right = tried.is_right(one.pose)
         # scans that share no view cannot show that a pose is right
         if (
-            right is None
-            or (right and measurements["common"] < MIN_COMMON)
-            or any(near(pose, other, SAME_BASIN_M, SAME_BASIN_RAD) for other in kept)
+            not one.scans
+            or right is None
+            or (right and one.measurements["common"] < MIN_COMMON)
+            or any(near(one.pose, other, SAME_BASIN_M, SAME_BASIN_RAD) for other in kept)
         ):
             continue
-        kept.append(pose)
-        yield Example(measurements, right, domain.name)
+        kept.append(one.pose)
+        yield Example(one.measurements, right, domain.name)
 
 
 def _guesses(tried: Tried, all_round: bool, rng: np.random.Generator) -> list[Array]:
@@ -145,16 +134,6 @@ def _guesses(tried: Tried, all_round: bool, rng: np.random.Generator) -> list[Ar
         make_pose(_yaw(rng.normal(0, 4)), [rng.normal(), across, 0.0]),
     ]
     return [tried.true @ move for move in moves + around]
-
-
-def _aligned(
-    tried: Tried, ranked: Candidate, scans: tuple[PreparedScan, PreparedScan], guess: Array, others: list[Hypothesis]
-) -> tuple[Array, Measurements]:
-    alignment = align_scans(*scans, guess)
-    hypothesis = Hypothesis.of(tried.query, ranked, tried.match, pose=alignment.pose, scans=scans, alignment=alignment)
-    rivals = [one.pose for one in others if not same_pose(one.pose, alignment.pose)]
-    found = measure(hypothesis) | compare_elsewhere(*scans, alignment.pose, alignment.information, rivals)
-    return alignment.pose, hypothesis.measurements | found | excess_differences(*scans, alignment.pose)
 
 
 def _between_worlds(places: list[ScannedPlace], rng: np.random.Generator) -> ScanPair:
