@@ -26,7 +26,7 @@ from umf_ros.verification.measurement import MEASUREMENTS
 
 MERGED = {"merged": 9.0}
 RIVALS, STANDING = ("rival_near", "rival_far"), ("upright_counterparts", "unexplained")
-PAIRS = {SCAN: (GOOD, BAD), SUBMAP: (GOOD | MERGED, BAD | MERGED), IMAGE: (GOOD_VIEWS, BAD_VIEWS)}
+PAIRS = {SCAN: (GOOD, BAD), SUBMAP: (GOOD | MERGED | {"repetition": 1.0}, BAD | MERGED), IMAGE: (GOOD_VIEWS, BAD_VIEWS)}
 NAN = math.nan
 
 
@@ -103,6 +103,15 @@ def test_submaps_that_differ_more_than_their_scans_do_are_no_closure(shipped: Ac
     submaps = GOOD | {"merged": 8.0, "unexplained": 0.08, "upright_counterparts": 0.7}
     usual, unusual = (shipped.probability(submaps | {"excess_differences": excess}) for excess in (1.2, 1.8))
     assert unusual < 0.9 < usual == shipped.probability(submaps)
+    # those of a narrow sensor show different sides
+    assert shipped.probability(submaps | {"excess_differences": 1.8, "narrow": 1.0}) == usual
+
+
+def test_a_submap_that_fits_itself_elsewhere_is_less_probable_and_not_refuted(shipped: AcceptanceModel) -> None:
+    submaps = GOOD | {"merged": 8.0, "unexplained": 0.08}
+    repeated, single = (submaps | {"repetition": worse} for worse in (0.1, 1.0))
+    assert shipped.probability(repeated) < shipped.probability(single) == shipped.probability(submaps)
+    assert refuted(repeated) is None
 
 
 def test_rivals_that_were_not_looked_for_speak_for_nothing_and_no_rivals_for_all() -> None:

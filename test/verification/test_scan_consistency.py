@@ -232,7 +232,16 @@ def test_submaps_of_one_place_differ_as_their_scans_do_and_those_of_the_next_ais
     assert excess(GOODS[3:]) < best < worst < excess(GOODS + np.array([0.9, 0.3]))
 
 
-def test_single_scans_and_submaps_of_a_narrow_sensor_show_no_usual_difference() -> None:
+def test_submaps_of_a_narrow_sensor_are_compared_by_scans_that_show_the_same() -> None:
+    """The second rover came the other way, through a hall that is the same turned round."""
+    there, back = (make_pose(np.eye(3), [x, 0.0, 0.0]) for x in (-14.0, -12.0))
+    pose = invert(there) @ make_pose(np.diag([-1.0, -1.0, 1.0]), [0.0, 0.0, 0.0]) @ back
+    match = submap(GOODS, -14.0, half_deg=60.0)
+    assert match.narrow and (match.middles[:, 0] > match.lidars[:, 0] + 5.0).all()
+    same, other = (submap(GOODS + shift, -12.0, half_deg=60.0) for shift in (0.0, np.array([0.9, 0.3])))
+    found = [excess_differences(match, query, pose)["excess_differences"] for query in (same, other)]
+    assert found[0] < 1.3 + const.NARROW_EXCESS < 1.9 + const.NARROW_EXCESS < found[1]
+
+
+def test_single_scans_show_no_usual_difference() -> None:
     assert excess_differences(MATCH, QUERY, THERE) == {}
-    ahead = submap(GOODS, half_deg=60.0)
-    assert ahead.narrow and excess_differences(ahead, ahead, np.eye(4)) == {}

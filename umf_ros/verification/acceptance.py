@@ -67,6 +67,11 @@ def _log_ratio(above: str, below: str, worst: float, best: float) -> Criterion:
     return Criterion(read, math.log(worst), math.log(best), names=(above, below))
 
 
+def _usual(known: Measurements) -> float:
+    """The excess of differences over what submaps of such a sensor have."""
+    return known.get("excess_differences", math.nan) - const.NARROW_EXCESS * known.get("narrow", 0.0)
+
+
 # every range is by hand: wide enough for right poses, beyond the reach of most wrong ones
 _OF_SCANS = {
     "tail_like_noise": _log_ratio("noise_m", "residual_p90_m", 0.15, 0.6),
@@ -80,11 +85,14 @@ _OF_SCANS = {
     "position_known": _log_of("position_std_m", 1.0, 0.05),
     "heading_known": _log_of("heading_std_deg", 5.0, 0.2),
 }
+_OF_SUBMAPS = _OF_SCANS | {
+    "usual_differences": Criterion(_usual, 1.9, 1.3, missing=1.0, names=("excess_differences", "narrow")),
+    "unrepeated": _of("repetition", 0.0, 0.6, missing=1.0),
+}
 CRITERIA: dict[str, dict[str, Criterion]] = {
     SCAN: _OF_SCANS,
     # submaps made from two sides share little
-    SUBMAP: {name: criterion for name, criterion in _OF_SCANS.items() if name != "common_view"}
-    | {"usual_differences": _of("excess_differences", 1.9, 1.3, missing=1.0)},
+    SUBMAP: {name: criterion for name, criterion in _OF_SUBMAPS.items() if name != "common_view"},
     IMAGE: {
         "inliers": Criterion(
             lambda known: math.log1p(known.get("inliers_image", 0.0) + known.get("inliers_cloud", 0.0)),
@@ -124,7 +132,7 @@ def refuted(measurements: Measurements) -> tuple[RejectReason, str] | None:
         return (RejectReason.REPEATED_IMAGE, "") if measurements["residual_sigmas"] < const.REPEATED_IMAGE else None
     if measurements.get("lead", math.nan) < 1.0:
         return RejectReason.PASSAGE if _in_passage(measurements) else RejectReason.AMBIGUOUS, ""
-    if measurements.get("repetition", math.nan) < const.MIN_REPETITION:
+    if kind_of(measurements) == SCAN and measurements.get("repetition", math.nan) < const.MIN_REPETITION:
         return RejectReason.AMBIGUOUS, "the scan fits itself elsewhere as well"
     if measurements.get("beyond_walls", math.nan) < const.BEYOND_WALLS:
         return RejectReason.WALLS_ALONE, f"{measurements['beyond_walls']:.0%} beyond three walls"

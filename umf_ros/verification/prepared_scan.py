@@ -145,6 +145,11 @@ class PreparedScan:
         return np.asarray(invert(self._lidars_T_body)[:, :3, 3])
 
     @cached_property
+    def middles(self) -> Array:
+        """(K, 3) m: the middle of what each merged scan shows; where they look all around, where they were taken."""
+        return np.array([scan.points.mean(axis=0) for scan in self.scans]) if self.narrow else self.lidars
+
+    @cached_property
     def narrow(self) -> bool:
         """Whether it was merged from scans that see little around the sensor."""
         if self.merged == 1:

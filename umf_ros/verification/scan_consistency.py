@@ -81,15 +81,14 @@ def excess_differences(match: PreparedScan, query: PreparedScan, pose: Array) ->
     many times as large the area is where its rays pass them by (a car that left takes a few square metres, goods of
     another aisle differ all along), and the additional share without a counterpart.
 
-    Empty for single scans, where next to nothing stands, and for sensors that see little around them, whose submaps
-    show different sides.
+    Empty for single scans, and where next to nothing stands.
 
     Args:
         match: the matched submap.
         query: the query's submap.
         pose: (4, 4) `match_T_query`.
     """
-    if match.narrow or query.narrow or not submaps(match, query):
+    if not submaps(match, query):
         return {}
     here, back = np.eye(4), invert(pose)
     between = np.vstack([_differences(query, match, pose, pose), _differences(match, query, back, here)])
@@ -111,7 +110,7 @@ def _differences(submap: PreparedScan, other: PreparedScan, other_T_submap: Arra
 
     Of the scans that are nearest to a scan of the other; within one submap each is compared with another.
     """
-    gaps = np.linalg.norm(transform(other_T_submap, submap.lidars)[:, None] - other.lidars, axis=2)
+    gaps = np.linalg.norm(transform(other_T_submap, submap.middles)[:, None] - other.middles, axis=2)
     if submap is other:
         np.fill_diagonal(gaps, np.inf)
     found = [np.empty((0, 5))]

@@ -203,6 +203,7 @@ class Verifier:
             one.probability = self._probability(one)
             if one.scans and (not least or self._objection(one) is None):
                 one.measurements |= self._commonplace(one)
+                one.probability = self._probability(one)
         for one, found in passages:  # those at another heading are rivals
             rivals = [other.pose for other, _ in passages if other is not one and other.candidate is one.candidate]
             if rivals:
