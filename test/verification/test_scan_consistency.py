@@ -78,7 +78,7 @@ def test_a_wall_that_one_scan_lacks_speaks_against_the_pose_whichever_scan_it_is
 
 def test_too_few_visible_points_count_against_the_pose_and_say_nothing_of_what_stands() -> None:
     away = compare_scans(MATCH, QUERY, make_pose(np.eye(3), [0.0, 0.0, 500.0]))
-    assert away["common"] == 0 and away["contradiction"] == 1 and away["counterparts"] == 0
+    assert away["common"] == 0 and away["contradiction"] == 1
     assert math.isnan(away["upright_counterparts"]) and math.isnan(away["unexplained"])
 
 
@@ -240,7 +240,7 @@ def test_submaps_of_a_narrow_sensor_are_compared_by_scans_that_show_the_same() -
     assert match.narrow and (match.middles[:, 0] > match.lidars[:, 0] + 5.0).all()
     same, other = (submap(GOODS + shift, -12.0, half_deg=60.0) for shift in (0.0, np.array([0.9, 0.3])))
     found = [excess_differences(match, query, pose)["excess_differences"] for query in (same, other)]
-    assert found[0] < 1.3 + const.NARROW_EXCESS < 1.9 + const.NARROW_EXCESS < found[1]
+    assert found[0] < 1.3 + 0.5 < 1.9 + 0.5 < found[1]
 
 
 def test_single_scans_show_no_usual_difference() -> None:

@@ -103,10 +103,6 @@ UNEXPLAINED = 2.0  # measured: in these reaches; of all measures the most alike 
 # 10050 and 10070, after test seed 78 had been seen: of 903 right submaps in eleven domains 5 differ as much as the ten
 # wrong ones of a warehouse
 SCANS_COMPARED, CELL_POINTS, CELL_PASSED, MISSING_WEIGHT = 4, 10, 0.03, 4.0
-# by how much submaps of narrow sensors differ more: they show different sides. measured: of 171 right ones in
-# validation domains 12 differ by more than 2.4, of 4,449 wrong ones 3,751. it was set after test seed 86 had been seen,
-# whose wrong submap of a lander has 2.2
-NARROW_EXCESS = 0.5
 
 # ambiguity: would the scans fit as well elsewhere?
 RIVAL_NEAR_M = np.array([-0.75, -0.5, 0.5, 0.75])  # geometry: beyond the error of a right pose, within a wrong one's

@@ -39,7 +39,6 @@ MEASUREMENTS = {
     "terrain_score": "correlation of the relief of both scans, in standard deviations of chance",
     "common": "share of a scan's points that the other should see, the smaller of both ways, as all that follow",
     "contradiction": "share of these that the other's rays passed by, the larger of both",
-    "counterparts": "share of these that have a counterpart",
     "upright_counterparts": "of walls, trunks and rocks that should be seen, the share with a counterpart",
     "unexplained": "of the same, the share that is far from everything, the larger of both",
     "excess_differences": "how much more the scans of two submaps differ from each other than those within each submap",
@@ -64,13 +63,10 @@ MEASUREMENTS = {
 
 def measure(hypothesis: Hypothesis) -> dict[str, float]:
     """Return the measurements of an aligned hypothesis by itself, but for the ambiguity, which is slow."""
-    alignment = hypothesis.alignment
-    assert alignment is not None
-    if isinstance(alignment, ViewAlignment):
-        found = _measure_views(alignment)
-    else:
-        found = _measure_scans(alignment, *hypothesis.scans)
-    covariance = covariance_of(alignment.information, NOMINAL)
+    fit = hypothesis.alignment
+    assert fit is not None
+    found = _measure_views(fit) if isinstance(fit, ViewAlignment) else _measure_scans(fit, *hypothesis.scans)
+    covariance = covariance_of(fit.information, NOMINAL)
     found["position_std_m"] = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
     found["heading_std_deg"] = float(np.degrees(np.sqrt(covariance[5, 5])))
     return known_only(found)

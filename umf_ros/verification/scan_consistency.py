@@ -30,9 +30,8 @@ def compare_scans(match: PreparedScan, query: PreparedScan, pose: Array) -> dict
 
     - `common`: share of a scan's points that the other should see;
     - `contradiction`: share of these that the other's rays passed by; 1 where there are next to none;
-    - `counterparts`: share of these that have a counterpart; 0 where there are next to none;
-    - `upright_counterparts`: the same of walls, trunks and rocks alone;
-    - `unexplained`: of the same, the share that is far from everything. Both NaN where next to nothing stands.
+    - `upright_counterparts`: of walls, trunks and rocks, the share of these that has a counterpart;
+    - `unexplained`: likewise, the share that is far from everything. Both NaN where next to nothing stands.
     """
     blur_m = common_blur(match, query)
     moved, back = transform(pose, query.sample), transform(invert(pose), match.sample)
@@ -48,14 +47,12 @@ def compare_scans(match: PreparedScan, query: PreparedScan, pose: Array) -> dict
             {
                 "common": float(seen.mean()) if len(seen) else 0.0,
                 "contradiction": _share(sight == Sight.PASSED, seen, 1.0),
-                "counterparts": _share(distance < reach, seen, 0.0),
                 "upright_counterparts": _share(distance < reach, seen & upright, np.nan),
                 "unexplained": _share(distance > const.UNEXPLAINED * reach, seen & upright, np.nan),
             }
         )
-    ours, theirs = ways
-    worse = {name: np.fmax if name in ("contradiction", "unexplained") else np.fmin for name in ours}
-    return {name: float(worse[name](ours[name], theirs[name])) for name in ours}
+    worse = {name: np.fmax if name in ("contradiction", "unexplained") else np.fmin for name in ways[0]}
+    return {name: float(choose.reduce([way[name] for way in ways])) for name, choose in worse.items()}
 
 
 def counterpart_reach(spacing: Array, blur_m: float) -> Array:
@@ -90,9 +87,8 @@ def excess_differences(match: PreparedScan, query: PreparedScan, pose: Array) ->
     """
     if not submaps(match, query):
         return {}
-    here, back = np.eye(4), invert(pose)
-    between = np.vstack([_differences(query, match, pose, pose), _differences(match, query, back, here)])
-    within = np.vstack([_differences(query, query, here, pose), _differences(match, match, here, here)])
+    between = np.vstack([_differences(query, match, pose, pose), _differences(match, query, invert(pose), np.eye(4))])
+    within = np.vstack([_differences(query, query, np.eye(4), pose), _differences(match, match, np.eye(4), np.eye(4))])
     metres, cells = np.unique(cubes(np.vstack([between, within])[:, :3], const.MAP_CELL_M[1]), return_inverse=True)
     parts = (between, cells[: len(between)]), (within, cells[len(between) :])
     counts = np.array([np.bincount(cell, minlength=len(metres)) for _, cell in parts])
