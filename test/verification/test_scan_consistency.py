@@ -241,7 +241,4 @@ def test_submaps_of_a_narrow_sensor_are_compared_by_scans_that_show_the_same() -
     same, other = (submap(GOODS + shift, -12.0, half_deg=60.0) for shift in (0.0, np.array([0.9, 0.3])))
     found = [excess_differences(match, query, pose)["excess_differences"] for query in (same, other)]
     assert found[0] < 1.3 + 0.5 < 1.9 + 0.5 < found[1]
-
-
-def test_single_scans_show_no_usual_difference() -> None:
-    assert excess_differences(MATCH, QUERY, THERE) == {}
+    assert excess_differences(MATCH, QUERY, THERE) == {}  # of single scans

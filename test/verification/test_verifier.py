@@ -342,9 +342,7 @@ def test_given_poses_are_judged_as_if_the_search_had_found_them(monkeypatch: pyt
     here, wrong = Verifier(Verification()).examine(query, [candidate(match)], [TRUE, away])[len(found) :]
     assert near(here.pose, TRUE, 0.05, 0.02) and not near(wrong.pose, TRUE, 1.0, 0.3)
     # the right pose, which the search found, is a rival of the wrong one alone
-    beside_right, beside_wrong = rivals[-2:]
-    assert any(near(pose, TRUE, 0.05, 0.02) for pose in beside_wrong)
-    assert not any(near(pose, TRUE, 0.05, 0.02) for pose in beside_right)
+    assert [any(near(pose, TRUE, 0.05, 0.02) for pose in beside) for beside in rivals[-2:]] == [False, True]
 
 
 def rivals_known(verdicts: list[Hypothesis]) -> list[bool]:

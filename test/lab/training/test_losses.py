@@ -48,17 +48,6 @@ def test_other_worlds_are_other_places():
     assert negative.all()
 
 
-def test_triplet_takes_the_hardest():
-    similarity = torch.tensor([[1.0, 0.9, 0.5, 0.8, -1.0]])
-    positive = torch.tensor([[False, True, True, False, False]])
-    negative = torch.tensor([[False, False, False, True, True]])
-    loss, active = batch_hard_triplet(similarity, positive, negative)
-    assert loss.item() == pytest.approx(1.0 - math.sqrt(0.4) + 0.2, rel=1e-4)
-    assert active.item() == 1
-    calm, none = batch_hard_triplet(torch.tensor([[1.0, 0.99, 0.99, -1.0, -1.0]]), positive, negative)
-    assert calm.item() == none.item() == 0
-
-
 def local_map(descriptors, saliency=None):
     shape = descriptors.shape[:2]
     saliency = torch.ones(shape) if saliency is None else saliency
@@ -115,22 +104,6 @@ def test_eligible_super_features():
     doubtful[0] = torch.nn.functional.normalize(base[0] + 0.95 * base[1], dim=0)
     assert eligible(base, doubtful).tolist() == [False, True, True, True]
     assert eligible(base, doubtful, ratio=1.0)[0]
-
-
-def super_map(descriptors, attention=None):
-    attention = torch.rand(*descriptors.shape[:2], 5) if attention is None else attention
-    return SuperMap(descriptors, torch.ones(descriptors.shape[:2]), attention)
-
-
-def test_super_contrastive():
-    same = torch.eye(4)[None].repeat(3, 1, 1)
-    different = torch.zeros(3, 3, dtype=torch.bool)
-    pair = torch.tensor([0]), torch.tensor([1])
-    assert super_contrastive(super_map(same), *pair, different).item() == 0
-    different[0, 2] = True
-    assert super_contrastive(super_map(same), *pair, different).item() == pytest.approx(1.1)
-    same[2] = -same[2]
-    assert super_contrastive(super_map(same), *pair, different).item() == 0
 
 
 # against plain loops
