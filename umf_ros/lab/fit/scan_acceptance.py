@@ -204,7 +204,7 @@ def main(
     console = Console()
     kinds = (only,) if only else (SCAN, SUBMAP)
     if again:
-        _write(console, fit(load_examples(EXAMPLES), kinds), out, dict.fromkeys(kinds, "--again"))
+        _write(console, load_examples(EXAMPLES), kinds, out, "--again")
         return
     settings = EmbeddingSettings(method=method, weights=weights, threads=1)
     elsewhere = in_domains(settings, pairs, folder, examples, jobs)
@@ -216,17 +216,15 @@ def main(
         surveyed.append((drive, embedded(drive, embedder)))
     along = [example for survey in surveyed for example in examine(*survey)]
     save_examples(found := along + elsewhere + _sprung_traps(), EXAMPLES)
-    _write(console, fit(found, kinds), out, dict.fromkeys(kinds, f"--worlds {count}"))
+    _write(console, found, kinds, out, f"--worlds {count}")
 
 
-def _write(
-    console: Console, fitted: tuple[AcceptanceModel, dict[str, float]], out: Path, options: dict[str, str]
-) -> None:
-    model, results = fitted
+def _write(console: Console, examples: list[Example], kinds: Sequence[str], out: Path, options: str) -> None:
+    model, results = fit(examples, kinds)
     for name, value in results.items():
         console.print(f"{name:32} {value:.4g}")
-    told = {kind: f"python -m umf_ros.lab.fit.scan_acceptance {these}" for kind, these in options.items()}
-    save_acceptance(model, out, told, results)
+    command = f"python -m umf_ros.lab.fit.scan_acceptance {options} --only "
+    save_acceptance(model, out, {kind: command + kind for kind in kinds}, results)
     console.print(f"wrote {out}")
 
 
