@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
+    from umf_ros.bags.reader import Bag
     from umf_ros.core.config import ParameterSource, Settings
     from umf_ros.core.frames import Frame
     from umf_ros.core.trajectory import Trajectory
@@ -50,39 +51,33 @@ class OpenRecording:
 
 
 def open_with_truth(
-    bag: Path,
-    config: ParameterSource,
-    chosen: tuple[str, str | None, Path | None],
-    files: tuple[Path | None, str, Path | None],
+    recording: Bag, settings: Settings, odometry: Path | None, odometry_frame: str, truth_path: Path | None
 ) -> OpenRecording:
-    """Open a recording to evaluate.
+    """Return a recording to evaluate.
 
     Args:
-        bag: the recording.
-        config: parameters.
-        chosen: data set, embedder and weights.
-        files: odometry, its frame, and ground truth.
+        recording: opened.
+        settings: to read it with.
+        odometry: a TUM file, where the recording has none.
+        odometry_frame: of its poses.
+        truth_path: a file of ground truth, where the recording has none.
 
     Raises:
-        ConfigError: wrong options, or there is no truth.
+        ConfigError: there is no truth.
         BagError: it cannot be read.
     """
-    odometry, frame, truth_path = files
-    frame_of_odometry = check_odometry_options(odometry, frame)
-
     from rich.console import Console
 
     from umf_ros.bags.frames import FrameReader
     from umf_ros.bags.trajectories import read_ground_truth, read_odometry
     from umf_ros.commands.console import WARNING
 
-    recording, settings = open_recording(bag, config, *chosen)
     truth = read_ground_truth(recording, truth_path)
     if truth is None:
-        raise ConfigError(f"{bag} holds no ground truth; name a file with --ground-truth")
-    path = read_odometry(odometry, frame_of_odometry, settings) if odometry else None
+        raise ConfigError(f"{recording.path} holds no ground truth; name a file with --ground-truth")
+    path = read_odometry(odometry, odometry_frame, settings) if odometry else None
     frames = FrameReader(recording, settings, path, warn=lambda text: Console().print(text, **WARNING))
-    return OpenRecording(bag, frames, settings, truth, recording.duration_s)
+    return OpenRecording(recording.path, frames, settings, truth, recording.duration_s)
 
 
 def choose_worlds(name: str, seed: int | None, quick: bool, count: int) -> list[TestWorld]:
@@ -265,8 +260,9 @@ def command(
         figures = every.sequences(data, rule) if every else _on_sequences(data, rule, weights, out)
     else:
         refuse_unused("a recording", of_worlds | of_lists | ({"--embedder": embedder} if every else {}))
-        chosen, files = (dataset, embedder, None if every else weights), (odometry, odometry_frame, ground_truth)
-        opened = open_with_truth(data, parameters(config, changes), chosen, files)
+        frame = check_odometry_options(odometry, odometry_frame)
+        recording = open_recording(data, parameters(config, changes), dataset, embedder, None if every else weights)
+        opened = open_with_truth(*recording, odometry, frame, ground_truth)
         figures = every.recording(opened) if every else _on_recording(opened, out)
     from umf_ros.lab.program import write_figures
 
