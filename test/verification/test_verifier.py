@@ -341,7 +341,7 @@ def test_given_poses_are_judged_as_if_the_search_had_found_them(monkeypatch: pyt
     away = TRUE @ make_pose(np.eye(3), [3.0, 5.0, 0.0])
     here, wrong = Verifier(Verification()).examine(query, [candidate(match)], [TRUE, away])[len(found) :]
     assert near(here.pose, TRUE, 0.05, 0.02) and not near(wrong.pose, TRUE, 1.0, 0.3)
-    # the right pose, which the search found, is a rival of the wrong one alone
+    # the pose that the search found
     assert [any(near(pose, TRUE, 0.05, 0.02) for pose in beside) for beside in rivals[-2:]] == [False, True]
 
 

@@ -267,16 +267,20 @@ class Verifier:
         for one in hypotheses:
             ends = [other.pose for other in before + kept if other.candidate is one.candidate]
             if not any(same_pose(one.pose, end) for end in ends):
-                if one.views is not None:
-                    one.alignment = one.views.align(one.pose)
-                else:
-                    one.scans = self.scans[one.keyframes[1]], self.scans[one.keyframes[0]]
-                    one.alignment = align_scans(*one.scans, one.pose)
-                one.pose = one.alignment.pose
+                self._align(one)
                 if not any(same_pose(one.pose, end) for end in ends):
                     self._measure(one)
                     kept.append(one)
         return kept
+
+    def _align(self, hypothesis: Hypothesis) -> None:
+        query, match = hypothesis.keyframes
+        scans = self.scans[match], self.scans[query]
+        if hypothesis.views is not None:
+            hypothesis.alignment = hypothesis.views.align(hypothesis.pose)
+        else:
+            hypothesis.scans, hypothesis.alignment = scans, align_scans(*scans, hypothesis.pose)
+        hypothesis.pose = hypothesis.alignment.pose
 
     def _best(
         self, query: Keyframe, ranked: list[Offered], judged: list[Hypothesis], tested: set[int]
@@ -304,9 +308,8 @@ class Verifier:
             return
         hypothesis.inlier_pixels = consistent_pixels(hypothesis, self._settings)
         covariance = closure_covariance(hypothesis, self._acceptance.covariances[hypothesis.kind])
-        hypothesis.closure = LoopClosure(
-            *hypothesis.endpoints, hypothesis.pose, covariance, hypothesis.probability or 0.0
-        )
+        probability = hypothesis.probability or 0.0
+        hypothesis.closure = LoopClosure(*hypothesis.endpoints, hypothesis.pose, covariance, probability)
 
     def _objection(self, hypothesis: Hypothesis) -> tuple[RejectReason, str] | None:
         """Why a hypothesis is no closure, with figures; None when it is one."""

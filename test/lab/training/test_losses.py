@@ -23,6 +23,8 @@ from umf_ros.lab.training.losses import (
 )
 from umf_ros.networks.local_features import LocalMap, SuperMap
 
+PAIR = torch.tensor([0]), torch.tensor([1])
+
 
 def test_labels_follow_distance_and_heading():
     poses = np.stack(
@@ -33,19 +35,23 @@ def test_labels_follow_distance_and_heading():
     assert negative[:, 0].tolist() == [False, False, False, True, False, True]
     _, thesis = label(places_of(0, poses), places_of(0, poses[:1]), Rule(negative_deg=30))
     assert thesis[4, 0]
-
-
-def test_headings_wrap_around():
-    poses = np.stack([pose_at(0, 0, 175), pose_at(0, 0, -175)])
-    positive, _ = label(places_of(0, poses), places_of(0, poses), Rule())
-    assert positive.all()
+    across = np.stack([pose_at(0, 0, 175), pose_at(0, 0, -175)])  # headings wrap around
+    assert label(places_of(0, across), places_of(0, across), Rule())[0].all()
 
 
 def test_other_worlds_are_other_places():
     here, there = places_of(0, pose_at(0, 0)[None]), places_of(1, pose_at(0, 0)[None])
     positive, negative = label(here, there, Rule())
-    assert not positive.any()
-    assert negative.all()
+    assert not positive.any() and negative.all()
+
+
+def test_triplet_takes_the_hardest_and_none_that_is_far_enough():
+    positive = torch.tensor([[False, True, True, False, False]])
+    negative = torch.tensor([[False, False, False, True, True]])
+    close, calm = [1.0, 0.9, 0.5, 0.8, -1.0], [1.0, 0.99, 0.99, -1.0, -1.0]
+    for similarities, excess in ((close, 1.2 - math.sqrt(0.4)), (calm, 0)):
+        loss, active = batch_hard_triplet(torch.tensor([similarities]), positive, negative)
+        assert loss.item() == pytest.approx(excess, rel=1e-4) and active.item() == (excess > 0)
 
 
 def local_map(descriptors, saliency=None):
@@ -59,9 +65,8 @@ def test_correspondence_forgives_neighbours():
     blurred = torch.eye(6) + 0.9 * torch.diag(torch.ones(5), 1)
     blurred = torch.nn.functional.normalize(blurred, dim=-1)[None].repeat(2, 1, 1)
     matches = torch.tensor([[[k, k] for k in range(6)]])
-    pair = torch.tensor([0]), torch.tensor([1])
-    strict = correspondence(local_map(blurred), *pair, matches, None)
-    assert correspondence(local_map(blurred), *pair, matches, near) < strict
+    strict = correspondence(local_map(blurred), *PAIR, matches, None)
+    assert correspondence(local_map(blurred), *PAIR, matches, near) < strict
 
 
 def test_salience_goes_to_what_matches():
@@ -70,23 +75,18 @@ def test_salience_goes_to_what_matches():
     descriptors[1, 4:] = descriptors[1, 4:].flip(0)
     saliency = torch.ones(2, 6, requires_grad=True)
     matches = torch.tensor([[[k, k] for k in range(6)]])
-    correspondence(local_map(descriptors, saliency), torch.tensor([0]), torch.tensor([1]), matches, None).backward()
-    assert (saliency.grad[:, :4] < 0).all()
-    assert (saliency.grad[:, 4:] > 0).all()
+    correspondence(local_map(descriptors, saliency), *PAIR, matches, None).backward()
+    assert (saliency.grad[:, :4] < 0).all() and (saliency.grad[:, 4:] > 0).all()
 
 
 def test_no_correspondences_cost_nothing():
     nothing = torch.full((1, 3, 2), -1)
-    loss = correspondence(
-        local_map(torch.eye(6)[None].repeat(2, 1, 1)), torch.tensor([0]), torch.tensor([1]), nothing, None
-    )
-    assert loss.item() == 0
+    assert correspondence(local_map(torch.eye(6)[None].repeat(2, 1, 1)), *PAIR, nothing, None).item() == 0
 
 
 def test_neighbours_do_not_wrap_around():
     near = neighbours(3, 4)
-    assert near[5].nonzero().flatten().tolist() == [0, 1, 2, 4, 5, 6, 8, 9, 10]
-    assert not near[3, 4]
+    assert near[5].nonzero().flatten().tolist() == [0, 1, 2, 4, 5, 6, 8, 9, 10] and not near[3, 4]
 
 
 def test_saliency_on_the_sky_is_wasted():
@@ -140,8 +140,7 @@ def test_triplets_are_a_loop_over_anchors(relations):
             excesses.append(far - near + 0.2)
     active = [excess for excess in excesses if excess > 0]
     loss, share = batch_hard_triplet(*relations)
-    assert len(excesses) == 4
-    assert loss.item() == pytest.approx(sum(active) / len(active), rel=1e-5)
+    assert len(excesses) == 4 and loss.item() == pytest.approx(sum(active) / len(active), rel=1e-5)
     assert share.item() == pytest.approx(len(active) / 4)
 
 
@@ -157,20 +156,13 @@ def test_neighbourhood_components_are_a_loop_over_queries(relations):
     assert neighbourhood_components(*relations).item() == pytest.approx(np.mean(penalties), rel=1e-5)
 
 
-def test_queries_without_a_rival_teach_nothing():
-    similarity = torch.eye(3, requires_grad=True)
+def test_queries_without_a_rival_and_batches_without_a_triplet_teach_nothing():
     nothing, everything = torch.zeros(3, 3, dtype=torch.bool), torch.ones(3, 3, dtype=torch.bool)
-    loss = neighbourhood_components(similarity, nothing, everything)
-    loss.backward()
-    assert loss.item() == 0 and not similarity.grad.any()
-
-
-def test_a_batch_without_any_triplet_costs_nothing_and_stays_a_number():
     similarity = torch.eye(3, requires_grad=True)
-    nothing = torch.zeros(3, 3, dtype=torch.bool)
-    loss, share = batch_hard_triplet(similarity, nothing, nothing)
-    loss.backward()
-    assert loss.item() == share.item() == 0 and torch.isfinite(similarity.grad).all()
+    loss = neighbourhood_components(similarity, nothing, everything)
+    triplets, share = batch_hard_triplet(similarity, nothing, nothing)
+    (loss + triplets).backward()
+    assert loss.item() == triplets.item() == share.item() == 0 and not similarity.grad.any()
     assert multi_similarity(similarity, nothing, nothing).item() == 0
 
 
@@ -212,7 +204,7 @@ def test_correspondence_is_a_loop_over_matches():
         loss -= (there + back) / 2 * worth[0] * worth[1]
         weight += worth[0] * worth[1]
     table = torch.tensor([[*matches, (-1, -1)]])
-    found = correspondence(local, torch.tensor([0]), torch.tensor([1]), table, None)
+    found = correspondence(local, *PAIR, table, None)
     assert found.item() == pytest.approx(loss / weight, rel=1e-5)
 
 
@@ -221,8 +213,16 @@ def test_what_is_masked_is_never_the_wrong_answer():
     loud = replace(local, descriptors=local.descriptors.clone())
     loud.descriptors[1, 4] = local.descriptors[0, 0]  # a perfect match that does not exist
     table = torch.tensor([[[0, 2]]])
-    one, two = (correspondence(found, torch.tensor([0]), torch.tensor([1]), table, None) for found in (local, loud))
+    one, two = (correspondence(found, *PAIR, table, None) for found in (local, loud))
     assert one.item() == pytest.approx(two.item(), rel=1e-5)
+
+
+def test_super_features_that_are_alike_cost_nothing_beside_none_or_far_ones():
+    same, negative = torch.eye(4).repeat(3, 1, 1), torch.eye(3) > 2
+    for other, sign, cost in ((False, 1, 0), (True, 1, 1.1), (True, -1, 0)):
+        negative[0, 2], same[2] = other, sign * torch.eye(4)
+        supers = SuperMap(same, torch.ones(3, 4), torch.rand(3, 4, 5))
+        assert super_contrastive(supers, *PAIR, negative).item() == pytest.approx(cost)
 
 
 def random_supers(seed: int) -> SuperMap:
@@ -240,7 +240,7 @@ def test_super_features_are_compared_id_by_id():
     squared = lambda a, b, k: float((supers.descriptors[a, k] - supers.descriptors[b, k]).square().sum())  # noqa: E731
     pulled = sum(squared(0, 1, k) for k in ids)
     pushed = sum(max(1.1 - squared(0, other, k), 0) for other in (2, 3) for k in ids) / 2
-    found = super_contrastive(supers, torch.tensor([0]), torch.tensor([1]), negative)
+    found = super_contrastive(supers, *PAIR, negative)
     assert found.item() == pytest.approx((pulled + pushed) / len(ids), rel=1e-4)
 
 
