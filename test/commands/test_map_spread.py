@@ -64,8 +64,7 @@ def test_ray_makes_the_same_map_though_a_worker_is_killed(
 ) -> None:
     here = str(Path(spread_module.__file__).parents[1])
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (here, os.environ.get("PYTHONPATH", "")))))
-    killer = Killer(tmp_path / "map" / "sessions")
-    killer.start()
+    (killer := Killer(tmp_path / "map" / "sessions")).start()
     way = "--ray", "local", "--workers", "2"
     ended = umf("map", *recordings, "--config", mini_config, "--out", tmp_path / "map", *way)
     assert ended.status == 0, ended.text

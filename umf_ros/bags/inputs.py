@@ -94,7 +94,7 @@ def _others(name: str, bag: Bag, present: Topics) -> list[str]:
 def _remedy(name: str, bag: Bag, present: Topics) -> str:
     others = _others(name, bag, present)
     if not others and name == "odometry":
-        return "--odometry FILE.tum supplies it, or vgicp on scans"
+        return "--odometry FILE.tum supplies it"
     if not others:
         return f"there is no other {TYPES[name][0]}"
     return f"--set topics.{name}={others[0]}" + (f" (or {either(others[1:])})" if others[1:] else "")

@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from multiprocessing import get_context
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from umf_ros.core.errors import UmfError, one_line
 
@@ -76,14 +76,15 @@ def _by_ray(work: Callable[[Task], None], tasks: Sequence[Task], address: str, w
     import ray
     from ray.exceptions import RayError, RayTaskError
 
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
     try:
         if address == LOCAL:
-            ray.init(
-                num_cpus=max(workers, 1), include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR
-            )
+            # Ray would give its workers the lowest priority
+            as_here = {"worker_niceness": 0}
+            ray.init(num_cpus=max(workers, 1), include_dashboard=False, _system_config=as_here, **quiet)
         else:
             _check_cluster(address)
-            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+            ray.init(address=address, **quiet)
     except (RayError, OSError, ValueError, RuntimeError) as error:
         raise UmfError(f"no Ray cluster at {address}: {one_line(error)}") from None
     try:

@@ -66,7 +66,7 @@ class Imported:
         """The content of a calibration file."""
         poses = {"body_T_lidar": self.body_T_lidar, "body_T_imu": np.eye(4)}
         poses |= {"body_T_camera": self.body_T_camera} if self.left else {}
-        told: dict[str, Any] = {**self.camera, **{name: pose_entry(pose) for name, pose in poses.items()}}
+        told = (self.camera if self.left else {}) | {name: pose_entry(pose) for name, pose in poses.items()}
         return told | {"lidar_time_offset_s": 0.0, "min_intensity": 0.0, "max_height_m": 0.0}
 
     def check(self, source: Path) -> Imported:

@@ -104,8 +104,7 @@ def nuscenes(source: Path) -> Imported:
         raise SensorFileError(f"{source} holds no tables: expected a folder v1.0-mini or the like")
     cities = sorted({str(row.get("location", "")) for row in _table(tables, "log")})
     if len(cities) > 1:
-        named = ", ".join(cities)
-        raise SensorFileError(f"{tables} holds drives of {len(cities)} cities ({named}): leave those of one")
+        raise SensorFileError(f"{tables} has drives of {len(cities)} cities ({', '.join(cities)}): leave those of one")
     try:
         return _import(source, tables).check(source)
     except (KeyError, TypeError, ValueError) as error:
@@ -125,16 +124,15 @@ def _import(source: Path, tables: Path) -> Imported:
     found = Imported({})
     found.left = [(_stamp(row), source / row["filename"]) for row in images]
     found.scans = [(_stamp(row), partial(read_scan, source / row["filename"], SCAN_COLUMNS)) for row in scans]
-    width, height = size_of(found.left[0][1]) if found.left else (1600, 900)
-    matrix = np.array([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
     if images:
         camera = mounted[images[0]["calibrated_sensor_token"]]
-        found.body_T_camera, matrix = _pose(camera), np.array(camera["camera_intrinsic"], float).reshape(3, 3)
+        matrix = np.array(camera["camera_intrinsic"], float).reshape(3, 3)
+        found.camera = {"camera": pinhole(*size_of(found.left[0][1]), matrix, baseline=0.0)}
+        found.body_T_camera = _pose(camera)
     if scans:
         found.body_T_lidar = _pose(mounted[scans[0]["calibrated_sensor_token"]])
         bodies = np.stack([_pose(poses[row["ego_pose_token"]]) for row in scans])
         found.truth = Trajectory(np.array([_stamp(row) for row in scans], np.int64), bodies)
-    found.camera = {"camera": pinhole(width, height, matrix, baseline=0.0)}
     return found
 
 
@@ -240,7 +238,7 @@ def tum_rgbd(source: Path) -> Imported:
 
 def folder(source: Path) -> Imported:
     """Images and scans with a times.txt of lines `FILE SECONDS`; what has right in its path is the right camera's."""
-    found = Imported({}, guessed=["the intrinsics of the camera", "the mountings of camera and LiDAR"])
+    found = Imported({})
     for line in lines_of(source / "times.txt"):
         name, _, seconds = line.rpartition(" ")
         path = source / name.strip()
@@ -254,8 +252,10 @@ def folder(source: Path) -> Imported:
             (found.right if "right" in name.lower() else found.left).append((stamp, path))
     for files in (found.left, found.right, found.scans):
         files.sort(key=lambda one: one[0])
-    found.check(source)
-    width, height = size_of(found.left[0][1]) if found.left else (640, 480)
+    if not found.check(source).left:
+        return found  # the body is the LiDAR
+    found.guessed = ["the intrinsics of the camera", "the mountings of camera and LiDAR"]
+    width, height = size_of(found.left[0][1])
     matrix = np.array([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
     found.camera = {"camera": pinhole(width, height, matrix, baseline=0.1 if found.right else 0.0)}
     return found
