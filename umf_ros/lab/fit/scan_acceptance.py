@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -194,7 +194,7 @@ def main(
     examples: Annotated[Path | None, typer.Option(help="keeps the domains' examples, for the same code")] = None,
     out: Annotated[Path, typer.Option(help="where the model goes")] = DEFAULT_OUT,
     again: Annotated[bool, typer.Option("--again", help="fit to the examples that the shipped model has")] = False,
-    only: Annotated[str, typer.Option(help="scan or submap: fit this part, and leave the other as it is")] = "",
+    only: Annotated[Literal["", "scan", "submap"], typer.Option(help="fit this part, leave the other as it is")] = "",
 ) -> None:
     """Examine candidates of validation worlds, fit acceptance to them, and write the model.
 
