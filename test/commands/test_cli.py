@@ -112,9 +112,7 @@ def test_the_version_is_the_package_s() -> None:
         (["export"], "missing argument 'out'"),
     ],
 )
-def test_wrong_usage_is_status_2_and_names_what_is_wrong(
-    somewhere_empty: Path, arguments: list[str], word: str
-) -> None:
+def test_wrong_usage_is_status_2_and_names_the_fault(somewhere_empty: Path, arguments: list[str], word: str) -> None:
     ended = umf(*arguments)
     assert ended.status == 2
     assert word in ended.text.lower() and "Traceback" not in ended.text

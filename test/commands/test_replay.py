@@ -112,9 +112,7 @@ def test_a_run_can_be_repeated_from_its_own_settings(run: Path, mini_bag: Path, 
     assert (tmp_path / "latest" / "config.yaml").read_text() == (run / "config.yaml").read_text()
 
 
-def test_scans_make_the_odometry_of_a_recording_that_has_none(
-    mini_bag: Path, mini_config: Path, tmp_path: Path
-) -> None:
+def test_scans_make_the_odometry_of_a_recording_without(mini_bag: Path, mini_config: Path, tmp_path: Path) -> None:
     config = tmp_path / "no_odometry.yaml"
     config.write_text(mini_config.read_text(encoding="utf-8").replace("loop:", "topics.odometry: '', loop:"))
     done = umf("replay", mini_bag, "--config", config, "--out", tmp_path / "out")

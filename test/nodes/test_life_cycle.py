@@ -55,9 +55,8 @@ def node(ros_context: None) -> Iterator[Back]:
 
 
 def entities(node: Node) -> Counter[str]:
-    topics = [f"to {item.topic_name}" for item in node.publishers] + [
-        f"from {i.topic_name}" for i in node.subscriptions
-    ]
+    sent, heard = ([one.topic_name for one in ends] for ends in (node.publishers, node.subscriptions))
+    topics = [f"to {name}" for name in sent] + [f"from {name}" for name in heard]
     return Counter([*topics, *(service.srv_name for service in node.services)])
 
 
@@ -252,9 +251,7 @@ def test_a_transition_that_is_not_possible_is_refused_in_the_response(
     # the second one of two in a row is queued behind the first
     both = client.create_client(ChangeState, f"/{name}/change_state")
     answers = [both.call_async(ChangeState.Request(transition=Transition(label="configure"))) for _ in range(2)]
-    assert wait_until(
-        lambda: all(one.done() for one in answers), 60.0, lambda: rclpy.spin_once(client, timeout_sec=0.1)
-    )
+    assert wait_until(lambda: all(it.done() for it in answers), 60.0, lambda: rclpy.spin_once(client, timeout_sec=0.1))
     assert [one.result().success for one in answers] == [True, False] and state() == State.PRIMARY_STATE_INACTIVE
     assert change(Transition(label="activate")) and not change(Transition(id=Transition.TRANSITION_CONFIGURE))
     assert state() == State.PRIMARY_STATE_ACTIVE

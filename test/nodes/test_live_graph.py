@@ -134,6 +134,4 @@ def test_the_back_end_optimises_what_the_front_end_found(live: LiveRun) -> None:
 def test_a_slam_system_gets_every_closure_as_a_factor(live: LiveRun) -> None:
     closures = rows(live.folder / "closures.csv")
     found = re.findall(r"closure (\d+): (\d+) -> (\d+)", live.subscriber)
-    assert [(match, query) for _, match, query in found] == [
-        (c["match_stamp_ns"], c["query_stamp_ns"]) for c in closures
-    ]
+    assert [tuple(ends) for _, *ends in found] == [(c["match_stamp_ns"], c["query_stamp_ns"]) for c in closures]

@@ -219,7 +219,7 @@ def test_graph_and_verdicts_are_there_again_after_a_kill(rig: Rig, tmp_path: Pat
     while taken != rig.taken:  # until a status later nothing more has come
         taken = rig.taken
         rig.values.clear()
-        rig.wait_for(lambda: rig.values.get("accepted"))
+        rig.wait_for(lambda: rig.values.get("accepted") == str(list(verdicts(rig).values()).count("accepted")))
     before, odometry_before, solver = rig.values["accepted"], rig.taken, Path(f"/proc/{process.child}")
     process.kill()
     assert wait_until(lambda: not solver.exists())

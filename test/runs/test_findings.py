@@ -213,9 +213,7 @@ def laid_over(scale: float) -> Overlay:
         ),
     ],
 )
-def test_what_is_wrong_with_the_sensors_is_said_with_its_number(
-    tmp_path: Path, sensors: SensorReport, said: str
-) -> None:
+def test_what_is_wrong_with_the_sensors_is_said_with_a_number(tmp_path: Path, sensors: SensorReport, said: str) -> None:
     first = look_first(examined(tmp_path, [closure(50, 10)], verdict=accepted(), sensors=sensors))[0]
     assert first.what.startswith(said), first.what
     assert first.remedy

@@ -191,9 +191,7 @@ def test_intrinsics_that_change_are_followed_and_one_stray_message_is_not(synchr
 
 
 @pytest.mark.parametrize("focal", [1e-300, 1e300, 0.5, float("nan")])
-def test_intrinsics_of_no_camera_are_refused_and_right_ones_used_later(
-    synchronizer: Synchronizer, focal: float
-) -> None:
+def test_intrinsics_of_no_camera_are_refused_and_right_ones_used_then(synchronizer: Synchronizer, focal: float) -> None:
     told: list[str] = []
     intake = MessageRouter(synchronizer, Topics(right_info="", right_image="", odometry=""), told.append)
     intake.take(LEFT_INFO, camera_info(START_NS, focal, (64, 48)))

@@ -44,9 +44,7 @@ def test_frames_do_not_depend_on_the_order_of_arrival(
 
 @checks
 @given(seeds, st.integers(1, 40))
-def test_every_message_is_counted_when_some_are_repeated_or_late(
-    calibration: Calibration, seed: int, wrong: int
-) -> None:
+def test_every_message_is_counted_when_some_are_twice_or_late(calibration: Calibration, seed: int, wrong: int) -> None:
     rng = np.random.default_rng(seed)
     measurements = in_order(rover(2.0))
     for index in rng.integers(len(measurements), size=wrong):

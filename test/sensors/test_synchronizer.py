@@ -370,9 +370,7 @@ def test_a_joined_scan_is_deskewed_by_the_stamps_of_its_parts(calibration: Calib
 
 
 @pytest.mark.parametrize("count", [2, 16])
-def test_parts_with_one_stamp_are_joined_and_a_message_twice_is_a_duplicate(
-    calibration: Calibration, count: int
-) -> None:
+def test_parts_of_one_stamp_are_joined_and_a_message_twice_is_a_duplicate(calibration: Calibration, count: int) -> None:
     synchronizer = Synchronizer(Sync(), calibration, {"cloud"})
     parts = [part for _, part in cut(whole_scan(), count, True, True)]
     stream = [("cloud", T0 + scan * 200 * MS, part) for scan in range(6) for part in [*parts, parts[-1]]]

@@ -96,6 +96,31 @@ def test_a_place_that_a_scan_has_found_is_not_looked_for(outing: Drive, database
     assert finder.find(query, known) == known
 
 
+@pytest.mark.parametrize(("row", "probability", "kind"), [(31, 0.92, "submap"), (5, 0.92, ""), (5, 0.96, "scan")])
+def test_submaps_decide_about_a_closure_of_scans_that_is_doubtful(
+    outing: Drive, database: PlaceDatabase, row: int, probability: float, kind: str
+) -> None:
+    finder = driven(outing, database, 80)
+    found = finder.find(outing.keyframes[80], [closure_of_scans(outing, 80, row, probability)])
+    assert [one.kind for one in found if one.accepted] == [kind] * bool(kind)
+    if kind == "submap":
+        assert np.linalg.norm((invert(relative(outing.truth[row], outing.truth[80])) @ found[0].pose)[:3, 3]) < 0.5
+
+
+def test_a_doubtful_closure_stays_where_there_are_no_submaps(database: PlaceDatabase) -> None:
+    spun = drive(rough_ground(5), half_width_rad=np.pi)
+    finder, doubtful = driven(spun, database, 80), closure_of_scans(spun, 80, 31, 0.92)
+    lost = replace(spun.keyframes[80], odom_T_body=None)
+    assert finder.find(spun.keyframes[80], [doubtful]) == finder.find(lost, [doubtful]) == [doubtful]
+
+
+def closure_of_scans(outing: Drive, query: int, match: int, probability: float) -> Hypothesis:
+    ends = outing.keyframes[query].stamp_ns, outing.keyframes[match].stamp_ns
+    pose = relative(outing.truth[match], outing.truth[query])
+    closure, place = LoopClosure(*ends, pose, np.eye(6), probability), Candidate(match, ends[1], 1.0)
+    return Hypothesis(ends[0], place, {"noise_m": 0.1}, probability=probability, closure=closure, pose=pose)
+
+
 def test_odometry_carries_a_closure_to_the_next_keyframes(outing: Drive, database: PlaceDatabase) -> None:
     query, later, match = outing.keyframes[80], outing.keyframes[84], outing.keyframes[30]
     assert query.odom_T_body is not None and match.odom_T_body is not None and later.odom_T_body is not None

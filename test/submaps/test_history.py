@@ -90,9 +90,7 @@ def test_a_stored_session_has_the_same_submaps(trail: SubmapHistory, outing: Dri
     assert len(one.points) == pytest.approx(len(other.points), rel=0.1)
 
 
-def test_scans_of_a_session_are_merged_as_far_as_its_own_odometry_allows(
-    outing: Drive, database: PlaceDatabase
-) -> None:
+def test_scans_of_a_session_are_merged_as_far_as_its_odometry_allows(outing: Drive, database: PlaceDatabase) -> None:
     half = outing.keyframes[: len(outing.keyframes) // 2]
     for number, slip in enumerate((0.0, 0.3)):
         for one in half:

@@ -59,9 +59,8 @@ def rays_of(points: Array) -> FreeSpace:
 def rays(count: int = 40_000, half_width_deg: float = 180.0) -> Array:
     azimuth = np.radians(RNG.uniform(-half_width_deg, half_width_deg, count))
     elevation = np.radians(RNG.uniform(-20, 20, count))
-    return np.column_stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
+    flat = np.cos(elevation)
+    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
 
 def hall(pose: Array, directions: Array, pillar: bool = False) -> Array:

@@ -59,7 +59,7 @@ class SubmapFinder:
         self.history.reset()
 
     def find(self, query: Keyframe, verdicts: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """The verdicts about the candidates of a keyframe, with those about submaps where scans found nothing.
+        """The verdicts about the candidates of a keyframe, with those about submaps where scans found nothing or doubt.
 
         Accepted ones come first.
 
@@ -67,9 +67,13 @@ class SubmapFinder:
             query: the newest keyframe, not yet remembered.
             verdicts: about its scan.
         """
+        doubtful = [one for one in verdicts if one.doubtful and can_be_merged(query)]
+        poses = {one.match_stamp_ns: one.pose for one in doubtful}
+        decided = self.compare(query, [one.candidate for one in doubtful], poses)
+        verdicts = sorted(_joined(decided, verdicts), key=lambda one: not one.accepted)
         asked = self.history.needed or self.history.keypoints.rows
-        if self._note_closures(query, verdicts) or not asked or not can_be_merged(query):
-            return list(verdicts)
+        if self._note_closures(query, verdicts) or doubtful or not asked or not can_be_merged(query):
+            return verdicts
         expected = self._expected(query)
         guesses = {candidate.stamp_ns: pose for candidate, pose in expected[:1]}
         compared = self.compare(query, self._candidates(query, verdicts, expected[:1]), guesses)

@@ -228,9 +228,8 @@ class SubmapHistory:
         if session not in self._drifts:
             rows, reach = self.rows(session, -np.inf, np.inf), round(const.ODOMETRY_REACH_M / const.MERGE_STEP_M)
             middle = rows[max(len(rows) // 2 - reach, 0) : len(rows) // 2 + reach].tolist()
-            self._drifts[session] = drift_along(
-                [one for one in map(self.store.__getitem__, middle) if can_be_merged(one)]
-            )
+            path = [one for one in map(self.store.__getitem__, middle) if can_be_merged(one)]
+            self._drifts[session] = drift_along(path)
         return self._drifts[session]
 
     def odometry(self, row: int) -> Array:

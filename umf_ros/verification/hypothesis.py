@@ -109,6 +109,11 @@ class Hypothesis:
         return self.reason is None
 
     @property
+    def doubtful(self) -> bool:
+        """Whether it is a closure of single scans that submaps decide, where there are any."""
+        return self.accepted and self.kind == SCAN and (self.probability or 0.0) < 1.0 - const.PROMISING
+
+    @property
     def outcome(self) -> str:
         """A short phrase for a person: "accepted", or the reason with its figures."""
         if self.reason is None:

@@ -290,9 +290,7 @@ class TemporalMemory:
         """How many of the remembered earlier keyframes found a pose that odometry carries over to this one."""
         earlier = [findings for stamp_ns, findings in self._findings.items() if stamp_ns != query.stamp_ns]
         carried = [[_carried(finding, query, match) for finding in findings] for findings in earlier]
-        return float(
-            sum(any(same_pose(pose, match_T_query) for pose in poses if pose is not None) for poses in carried)
-        )
+        return float(sum(any(one is not None and same_pose(one, match_T_query) for one in poses) for poses in carried))
 
 
 def _carried(found: _Finding, query: Keyframe, match: Keyframe) -> Array | None:

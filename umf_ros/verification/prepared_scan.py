@@ -45,9 +45,8 @@ def _cell_means(points: Points, values: Points) -> Points:
     """Means (M, C) float32 of values (N, C) over the points (N, 3) nearer than 40 m in every occupied cube."""
     points, values = (np.ascontiguousarray(rows, np.float32) for rows in (points, values))
     means = kernels.cell_means(points, values, const.THIN_CELL_M, const.MAX_RANGE_M)
-    if len(means) < const.SAMPLE:
-        means = kernels.cell_means(points, values, const.THIN_CELL_M / 2, const.MAX_RANGE_M)
-    return means
+    few = len(means) < const.SAMPLE
+    return kernels.cell_means(points, values, const.THIN_CELL_M / 2, const.MAX_RANGE_M) if few else means
 
 
 class OrientedPoints(NamedTuple):

@@ -191,11 +191,10 @@ class Verifier:
         judged: list[Hypothesis] = []
         passages: list[tuple[Hypothesis, Position]] = []
         for one in aligned:
-            promises = self._promises(one, least)
             if any(other.candidate is one.candidate and found.compared(one.pose) for other, found in passages):
                 continue
             judged.append(one)
-            if promises:
+            if self._promises(one, least):
                 rivals = [other.pose for other in (*known, *aligned) if other.candidate is one.candidate]
                 found = self._look_elsewhere(one, [pose for pose in rivals if not same_pose(pose, one.pose)])
                 passages += [(one, found)] if found else []
@@ -210,10 +209,9 @@ class Verifier:
                 one.measurements["lead"] = found.lead_over(rivals)
         return judged
 
-    def _promises(self, hypothesis: Hypothesis, least: float) -> bool:
+    def _promises(self, one: Hypothesis, least: float) -> bool:
         """Whether a hypothesis of scans can be so probable: it is, if no other pose fits the scans."""
-        unrivalled = hypothesis.measurements | WITHOUT_RIVALS
-        return bool(hypothesis.scans) and self._acceptance.probability(unrivalled) >= least
+        return bool(one.scans) and self._acceptance.probability(one.measurements | WITHOUT_RIVALS) >= least
 
     def _measure(self, hypothesis: Hypothesis) -> None:
         """Measure the pose; nothing stays of a pose that was measured before."""
@@ -228,9 +226,8 @@ class Verifier:
         query, match = hypothesis.keyframes
         found = locate_along(theirs, ours, hypothesis.pose, _is_turned(query, match, hypothesis.pose))
         if found is None:
-            hypothesis.measurements |= compare_elsewhere(
-                theirs, ours, hypothesis.pose, hypothesis.alignment.information, rivals
-            )
+            information = hypothesis.alignment.information
+            hypothesis.measurements |= compare_elsewhere(theirs, ours, hypothesis.pose, information, rivals)
             return None
         if found.pose is not hypothesis.pose:
             hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)

@@ -179,9 +179,7 @@ def vlp_16_and_camera(cameras: tuple[str, ...] = ("/camera",)) -> list[Entry]:
     return entries
 
 
-def test_a_rover_of_no_data_set_is_replayed_without_a_parameter(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rover_of_no_data_set_needs_no_parameter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bag = write(tmp_path / "bag.mcap", vlp_16_and_camera(), monkeypatch)
     line = (
         "inputs: left_image /camera/image_raw, left_info /camera/camera_info, cloud /velodyne_points, "

@@ -108,9 +108,7 @@ def segments(player: subprocess.Popen[str]) -> list[int]:
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test_dozens_of_images_find_room_unless_the_user_says_otherwise(
-    own: bool, ros_context: None, tmp_path: Path
-) -> None:
+def test_dozens_of_images_find_room_unless_a_user_says_otherwise(own: bool, ros_context: None, tmp_path: Path) -> None:
     bag = write_mcap(tmp_path / "a.mcap", traverse(0.5))
     profile = tmp_path / "own.xml"
     profile.write_text('<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"></dds>')

@@ -48,7 +48,7 @@ class Comparer:
         self._views, self._verifier = views, Verifier(settings)
 
     def compare(self, match: PlaceView, query: PlaceView) -> Row:
-        """Compare two views, and their submaps where the scans give no pose; return the values of `RESULT_COLUMNS`.
+        """Compare two views, and submaps where the scans give no certain pose; return the values of `RESULT_COLUMNS`.
 
         Raises:
             UmfError: one of them cannot be read; says which.
@@ -62,7 +62,7 @@ class Comparer:
         elapsed_ms = sum(self._verifier.latency_ms.values())
         merged = their_submap or their_scan, our_submap or our_scan
         submaps = (their_submap or our_submap) is not None and not _share_scans(match, query, *merged)
-        if verdict.closure is None and submaps:
+        if submaps and (verdict.closure is None or verdict.doubtful):
             verdict = judge(self._verifier, *merged)
             elapsed_ms += sum(self._verifier.latency_ms.values())
         blind = verdict.closure is None and not any(keyframe.has_depth for keyframe in keyframes)

@@ -213,15 +213,15 @@ def pairs_of(places: list[ScannedPlace], domain: Domain, rng: np.random.Generato
 
 
 def verified(verifier: Verifier, pair: ScanPair) -> tuple[LoopClosure | None, bool]:
-    """The closure of a pair by its scans or else by its submaps, and whether these were asked."""
+    """The closure of a pair by its scans or, where these find none or doubt, by its submaps; and whether by these."""
     verifier.reset()
     candidate = Candidate(0, pair.match.keyframe.stamp_ns, pair.similarity)
-    closure = verifier.verify(pair.query.keyframe, [(candidate, pair.match.keyframe)])[0].closure
-    if closure is not None or pair.query.before is None:
-        return closure, False
+    found = verifier.verify(pair.query.keyframe, [(candidate, pair.match.keyframe)])[0]
+    if pair.query.before is None or (found.accepted and not found.doubtful):
+        return found.closure, False
     verifier.reset()
-    match = pair.match.around or pair.match.keyframe
-    return verifier.verify(pair.query.before, [(candidate, match)])[0].closure, True
+    match, poses = pair.match.around or pair.match.keyframe, {candidate.stamp_ns: found.pose}
+    return verifier.verify(pair.query.before, [(candidate, match)], poses if found.doubtful else {})[0].closure, True
 
 
 def _distance(query: ScannedPlace, match: ScannedPlace) -> float:
