@@ -46,7 +46,8 @@ class Process:
 
     @property
     def output(self) -> str:
-        return self._log.read_text()
+        lines = self._log.read_text().splitlines(keepends=True)
+        return "".join(line for line in lines if "[RTPS_" not in line)  # of ports that killed processes left
 
     @property
     def exit_code(self) -> int | None:
@@ -105,9 +106,7 @@ def call_service(node: Any, kind: type, service: str, request: object) -> Any:
     raise AssertionError(f"{service} never answers")
 
 
-def wait_until(
-    condition: Callable[[], bool], timeout_s: float = 30.0, spin: Callable[[], object] | None = None
-) -> bool:
+def wait_until(condition: Callable[[], bool], timeout_s: float = 30, spin: Callable[[], object] | None = None) -> bool:
     deadline = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > deadline:
