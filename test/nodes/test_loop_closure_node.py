@@ -49,8 +49,8 @@ class Rig(Peer):
 
     def __init__(self) -> None:
         super().__init__("loop_closure_node", "detector")
-        self.images = self.create_publisher(Image, "/stereo/left/image_rect", 10)
-        self.clouds = self.create_publisher(PointCloud2, "/bf_lidar/points_raw", 10)
+        self.images = self.create_publisher(Image, "/stereo/left/image_rect", 100)
+        self.clouds = self.create_publisher(PointCloud2, "/bf_lidar/points_raw", 100)
         self.scans: list[PointCloud2] = []
         self.create_subscription(PointCloud2, "/loop_closure_node/keyframe_scans", self.scans.append, 50)
         self.rng = np.random.default_rng(0)
@@ -132,6 +132,7 @@ def test_it_takes_frames_survives_bad_ones_and_ends_in_order(rig: Rig, node: Pro
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_what_waits_at_the_end_is_told_and_can_be_played_again(rig: Rig, tmp_path: Path, number: int) -> None:
     own = f"results_dir:={tmp_path / 'run'}", f"database.path:={tmp_path / 'map.sqlite'}", "worker.queue_size:=100"
+    own += "qos.reliability:=reliable", "qos.depth:=100"  # a busy machine loses nothing
     slow = [sys.executable, str(Path(__file__).parent / "slow_node.py"), "detect"]
     node = Process(MODULE, tmp_path / "slow.log", *PARAMETERS, *own, command=slow)
     stamps = [START_NS + i * 213_000_000 for i in range(30)]
