@@ -16,15 +16,15 @@ from umf_ros.core.trajectory import Trajectory
 from umf_ros.sensors.assembly import deskew
 from umf_ros.sensors.decode import OdometrySample
 
-THINNED_M, RANGE_M, NEIGHBOURS = 0.25, 80.0, 40
-"""Voxels of a scan, range of a scan, and points that a surface is fitted to: they have to reach the next ring of a
-LiDAR of 16 rings, or each ring would be a line that slides along itself."""
+THINNED_M, RANGE_M = 0.25, 80.0
+"""Voxels of a scan, and its range."""
 DENSE_POINTS = 8000
 """Points of a thinned scan from which on it is dense."""
-SPARSE, DENSE = (3000, 0.5), (12_000, 1.0)
-"""Most points of a registration, and voxels of the map in m. Measured: a real street of 64 rings is 7.5 m long with the
-latter, as KISS-ICP finds it too, and 5.9 m with the former; sparse scans have .10 m of error with the former, .12 with
-the latter's points and .18 m with its voxels."""
+SPARSE, DENSE = (3000, 0.5, 40), (12_000, 1.0, 10)
+"""Most points of a registration, voxels of the map in m, and points that a surface is fitted to: those of sparse scans
+have to reach the next ring, or each ring would be a line that slides along itself. Measured: a real street of 64 rings
+is 7.7 m long with the latter (7.5 by KISS-ICP), and 5.9 m with the former; sparse scans have .10 m of error with the
+former, .12 with the latter's points and .18 m with its voxels."""
 MAX_LOST, FEWEST_POINTS = 0.05, 100
 """Share of scans that may not fit the motion before them (*by hand*: .01 on good drives, .5 where track is lost), and
 returns of a scan that is used."""
@@ -55,7 +55,7 @@ class Vgicp:
 
     def __init__(self) -> None:
         self._odom_T_body: Array | None = None
-        self._most_points, self._voxel_m = SPARSE
+        self._most_points, self._voxel_m, self._neighbours = SPARSE
         self.overlap = 1.0
 
     def register(self, points: Points, step: Array) -> Array:
@@ -63,9 +63,9 @@ class Vgicp:
         near = points[np.einsum("ij,ij->i", points, points) < RANGE_M**2]
         thinned = small_gicp.voxelgrid_sampling(near.astype(float), THINNED_M, 1).points()
         if self._odom_T_body is None and len(thinned) > DENSE_POINTS:
-            self._most_points, self._voxel_m = DENSE
+            self._most_points, self._voxel_m, self._neighbours = DENSE
         scan = small_gicp.PointCloud(thinned[evenly(len(thinned), self._most_points)])
-        small_gicp.estimate_covariances(scan, num_neighbors=NEIGHBOURS, num_threads=1)
+        small_gicp.estimate_covariances(scan, num_neighbors=self._neighbours, num_threads=1)
         if self._odom_T_body is None:
             self._odom_T_body = np.eye(4)
             self._map = small_gicp.GaussianVoxelMap(self._voxel_m)
