@@ -16,6 +16,8 @@ DEMO ?=
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 PYTHON ?= $(shell for p in python3.12 python3.11 python3; do $$p -c 'import sys; sys.exit(not (3,11) <= sys.version_info[:2] <= (3,12))' 2>/dev/null && echo $$p && break; done)
 BIN := $(VENV)/bin
+# commands start in half of the time where Python may keep compiled modules
+export PYTHONDONTWRITEBYTECODE :=
 # test files in parallel, each worker with one thread; one more than cores, for tests of nodes mostly wait
 JOBS ?= $(shell cores=$$(getconf _NPROCESSORS_ONLN); echo $$((cores < 4 ? cores + 1 : 5)))
 # twice quiet: errors alone; compiled when they are imported, most modules never
