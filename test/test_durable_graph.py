@@ -119,9 +119,7 @@ def test_ending_a_graph_keeps_its_journal(world: GraphWorld, tmp_path: Path) -> 
     assert len(made(tmp_path / "graph.sqlite").graph.trajectory()[0]) <= 10
 
 
-def test_settings_that_were_changed_hold_for_the_next_graph_and_after_a_restart(
-    world: GraphWorld, tmp_path: Path
-) -> None:
+def test_changed_settings_hold_for_the_next_graph_and_after_a_restart(world: GraphWorld, tmp_path: Path) -> None:
     graph, strict = made(tmp_path / "graph.sqlite"), SETTINGS.model_copy(update={"max_closure_m": 1e-3})
     graph.retune(strict)
     graph.end()

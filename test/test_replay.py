@@ -102,9 +102,7 @@ def test_a_whole_run_leaves_tables_trajectories_and_graph(folder: Path, settings
     assert len(read_tum(folder / "trajectory_odometry.tum")) > 2
 
 
-def test_a_run_that_is_stopped_is_as_complete_as_far_as_it_went(
-    folder: Path, settings: Settings, stream: Stream
-) -> None:
+def test_a_stopped_run_is_complete_as_far_as_it_went(folder: Path, settings: Settings, stream: Stream) -> None:
     replay = replay_of(folder, settings)
     for count, _ in enumerate(replay.run(stream), 1):
         if count == 7:
@@ -116,9 +114,7 @@ def test_a_run_that_is_stopped_is_as_complete_as_far_as_it_went(
     assert read_tum(folder / "trajectory_odometry.tum").stamps_ns[-1] <= frames_of(stream)[7].stamp_ns
 
 
-def test_a_killed_replay_is_exported_like_one_that_was_stopped(
-    tmp_path: Path, settings: Settings, stream: Stream
-) -> None:
+def test_a_killed_replay_is_exported_like_a_stopped_one(tmp_path: Path, settings: Settings, stream: Stream) -> None:
     """The process of the killed one ends without any of its own code being run again."""
     for name in ("stopped", "killed"):
         (tmp_path / name).mkdir()

@@ -70,9 +70,7 @@ def test_recordings_are_found_in_folders_and_once(tmp_path: Path) -> None:
         find_recordings([tmp_path / "x.mcap"])
 
 
-def test_one_recording_becomes_a_run_with_places_and_all_its_odometry(
-    tmp_path: Path, opening: Opening, bag: Path
-) -> None:
+def test_one_recording_becomes_a_run_with_places_and_all_odometry(tmp_path: Path, opening: Opening, bag: Path) -> None:
     heard: list[float] = []
     replay_session(bag, opening, tmp_path / "run", lambda done, _: heard.append(done))
     assert heard == sorted(heard) and 0.9 < heard[-1] <= 1

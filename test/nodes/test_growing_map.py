@@ -22,9 +22,7 @@ def keyframes_of(folder: Path) -> int:
     return json.loads(path.read_text())["keyframes"] if path.is_file() else 0
 
 
-def test_what_is_seen_while_localising_becomes_a_session_at_save_and_at_the_end(
-    ros_context: None, tmp_path: Path
-) -> None:
+def test_what_localising_sees_becomes_a_session_at_save_and_at_the_end(ros_context: None, tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text(CALIBRATION)
     common = "embedding.method:=thumbnail", f"calibration:={tmp_path / 'rig.yaml'}", "qos.reliability:=reliable"
     rig, before, after = Vlp16Rover(), tmp_path / "before", tmp_path / "after"

@@ -114,6 +114,14 @@ def test_identical_door_frames_at_equal_distances_are_rivals_of_each_other() -> 
         assert lead(match, query, shift(metres)) < 1.0
 
 
+def test_a_heading_that_odometry_does_not_tell_needs_more_evidence() -> None:
+    """The sensor's pattern favours the heading at which it meets itself."""
+    match, query = (corridor(x, number, (2.0, 7.0), 0.3) for number, x in enumerate((0.0, 1.5), 1))
+    found, turn = locate_along(match, query, shift(1.5)), Rotation.from_euler("z", np.pi).as_matrix()
+    rivals = [shift(1.5) @ make_pose(turn, np.zeros(3))]
+    assert found is not None and found.lead_over(rivals) > 1.0 > found.lead_over(rivals, headed=False)
+
+
 def test_a_scan_leads_all_others_with_itself() -> None:
     """Also where every alignment ends at the same pose."""
     found = locate_along(corridor(0.0, 1, UNEVEN, 0.3), corridor(0.0, 1, UNEVEN, 0.3), np.eye(4))
@@ -336,8 +344,8 @@ def test_a_pose_is_turned_round_to_what_odometry_has(driven_deg: float, pose_deg
         Keyframe(stamp_ns, Embedding(np.ones(4, np.float32)), CAMERA, BODY_T_CAMERA, points, odom)
         for stamp_ns, odom in ((1, turned(30)), (2, turned(30 + driven_deg)))
     )
-    assert verifier._is_turned(query, match, turned(pose_deg)) == expected
-    assert verifier._is_turned(replace(query, session=1), match, turned(pose_deg)) == (pose_deg == 180)
+    assert verifier._is_turned(turned(pose_deg), query, match) == expected
+    assert verifier._is_turned(turned(pose_deg), replace(query, session=1), match) == (pose_deg == 180)
 
 
 @pytest.mark.parametrize("seed", range(4))

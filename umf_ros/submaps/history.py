@@ -27,10 +27,9 @@ def submap_of(keyframe: Keyframe, others: Sequence[Keyframe], drift: DriftMeter)
         drift: of the odometry.
     """
     reach_m = median_range(keyframe.points)
-    needed = [
-        one for one in needed_scans(keyframe, others) if drift.blur(_way_m(keyframe, one), reach_m) < const.MAX_BLUR_M
-    ]
-    return _merged(keyframe, needed, drift) if needed else None
+    needed = needed_scans(keyframe, others)
+    sharp = [one for one in needed if drift.blur(_way_m(keyframe, one), reach_m) < const.MAX_BLUR_M]
+    return _merged(keyframe, sharp, drift) if sharp else None
 
 
 def needed_scans(keyframe: Keyframe, others: Sequence[Keyframe]) -> Sequence[Keyframe]:

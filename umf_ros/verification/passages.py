@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.geometry import Array, evenly, invert, make_pose, near, transform
+from umf_ros.core.geometry import Array, evenly, heading, invert, make_pose, near, relative, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur, same_rays, submaps
 from umf_ros.verification.scan_alignment import run_gicp
@@ -175,13 +175,19 @@ class Comparison:
         """Whether points tell positions apart: no pattern of a sensor is in both scans."""
         return not (self._turned or submaps(*self._scans) or same_rays(*self._scans))
 
-    def leads(self, pose: Array, rivals: Sequence[Array], needed: float) -> Array:
-        """(R,) evidence for a pose (4, 4) over each rival as a share of what is needed; by points where these tell."""
+    def leads(self, pose: Array, rivals: Sequence[Array], needed: float, headed: bool = True) -> Array:
+        """(R,) evidence for a pose (4, 4) over each rival as a share of what is needed; by points where these tell.
+
+        Without a heading that odometry tells, as much is needed over a rival that is turned round as for a pose that
+        is: the sensor's pattern favours the heading at which it meets itself.
+        """
         poses = np.stack([pose, *rivals])
-        told = self.fits(poses).evidence(0)[1:] / needed
+        turned = np.abs([heading(relative(pose, one)) for one in rivals]) > (np.inf if headed else np.pi / 2)
+        told = self.fits(poses).evidence(0)[1:] / np.where(turned, max(needed, const.TURNED_EVIDENCE), needed)
         if (told >= 1.0).all() or not self.points_tell:
             return told
-        return np.fmax(told, point_leads(*self._scans, poses) / (const.CLEAR_LEAD * const.MIN_LEAD))
+        clear = const.CLEAR_LEAD * const.MIN_LEAD
+        return np.where(turned, told, np.fmax(told, point_leads(*self._scans, poses) / clear))
 
     def lead_along(self, pose: Array) -> float:
         """The `lead` of a pose (4, 4) by `ambiguity`, as a share of a clear one."""
@@ -225,17 +231,17 @@ class Position(NamedTuple):
     needed: float
     comparison: Comparison
 
-    def lead_over(self, poses: Sequence[Array]) -> float:
+    def lead_over(self, poses: Sequence[Array], headed: bool = True) -> float:
         """Return the evidence as a share of what a closure needs, also against tilted poses and these (4, 4).
 
         Where surfaces tell too little, a clear lead by points is enough if the sensor's pattern is not in both scans,
-        but for poses that are turned round.
+        but for poses that are turned round. `headed`: odometry tells the heading.
         """
         along, comparison = self.evidence / self.needed, self.comparison
         if along < 1.0 and comparison.points_tell:
             along = max(along, comparison.lead_along(self.pose))
         rivals = [*comparison.tilted(self.pose), *poses]
-        return float(comparison.leads(self.pose, rivals, self.needed).min(initial=along)) if rivals else along
+        return float(comparison.leads(self.pose, rivals, self.needed, headed).min(initial=along)) if rivals else along
 
     def compared(self, pose: Array) -> bool:
         """Whether a pose (4, 4), up to its position along the passage, is this one: it was compared with it."""

@@ -142,15 +142,13 @@ def _correlate(around: Spectra, turned: Spectra, side: int) -> NDArray[np.float3
     return np.asarray(scipy.fft.irfft(rows, side, axis=-1)[..., window].swapaxes(0, 1))
 
 
-def _peaks(
-    volumes: NDArray[np.float32], headings: NDArray[np.intp], count: int, cell_m: float
-) -> list[tuple[int, Array]]:
+def _peaks(volumes: NDArray[np.float32], turns: NDArray[np.intp], count: int, cell_m: float) -> list[tuple[int, Array]]:
     """Heading and shift (2,) m of the highest peaks of each volume, so many of each, no two of them neighbours."""
     peaks: list[tuple[int, Array]] = []
     every = np.full((len(const.ALL_HEADINGS), *volumes.shape[2:]), -np.inf, np.float32)
     taken = np.zeros(every.shape, bool)
     for volume in volumes:
-        every[headings] = volume
+        every[turns] = volume
         for _ in range(count):
             every[taken] = -np.inf
             index, row, column = (int(i) for i in np.unravel_index(int(every.argmax()), every.shape))

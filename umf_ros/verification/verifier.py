@@ -11,7 +11,7 @@ import numpy as np
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Keyframe, LoopClosure
-from umf_ros.core.geometry import Array, heading, invert, relative
+from umf_ros.core.geometry import Array, heading, relative
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
@@ -206,7 +206,7 @@ class Verifier:
         for one, found in passages:  # those at another heading are rivals
             rivals = [other.pose for other, _ in passages if other is not one and other.candidate is one.candidate]
             if rivals:
-                one.measurements["lead"] = found.lead_over(rivals)
+                one.measurements["lead"] = found.lead_over(rivals, _expected(*one.keyframes) is not None)
         return judged
 
     def _promises(self, one: Hypothesis, least: float) -> bool:
@@ -219,20 +219,18 @@ class Verifier:
         of_pose = measure(hypothesis) | {"support": self._memory.support(query, match, hypothesis.pose)}
         hypothesis.measurements = measurements_of(hypothesis.candidate) | of_pose
 
-    def _look_elsewhere(self, hypothesis: Hypothesis, rivals: list[Array]) -> Position | None:
+    def _look_elsewhere(self, one: Hypothesis, rivals: list[Array]) -> Position | None:
         """Compare with other poses; of scans in a passage, move to the best position along it, and return that."""
-        theirs, ours = hypothesis.scans
-        assert hypothesis.alignment is not None
-        query, match = hypothesis.keyframes
-        found = locate_along(theirs, ours, hypothesis.pose, _is_turned(query, match, hypothesis.pose))
+        theirs, ours = one.scans
+        assert one.alignment is not None
+        found = locate_along(theirs, ours, one.pose, _is_turned(one.pose, *one.keyframes))
         if found is None:
-            information = hypothesis.alignment.information
-            hypothesis.measurements |= compare_elsewhere(theirs, ours, hypothesis.pose, information, rivals)
+            one.measurements |= compare_elsewhere(theirs, ours, one.pose, one.alignment.information, rivals)
             return None
-        if found.pose is not hypothesis.pose:
-            hypothesis.pose, hypothesis.alignment = found.pose, inspect(theirs, ours, found.pose)
-            self._measure(hypothesis)
-        hypothesis.measurements["lead"] = found.lead_over([])
+        if found.pose is not one.pose:
+            one.pose, one.alignment = found.pose, inspect(theirs, ours, found.pose)
+            self._measure(one)
+        one.measurements["lead"] = found.lead_over([])
         return found
 
     @staticmethod
@@ -331,8 +329,14 @@ def _most_probable(judged: list[Hypothesis]) -> dict[int, Hypothesis]:
     return {one.candidate.index: one for one in sorted(judged, key=lambda one: one.probability or 0.0)}
 
 
-def _is_turned(query: Keyframe, match: Keyframe, pose: Array) -> bool:
+def _expected(query: Keyframe, match: Keyframe) -> Array | None:
+    """The pose `match_T_query` that odometry has; None where there is none."""
+    if query.session != match.session or query.odom_T_body is None or match.odom_T_body is None:
+        return None
+    return relative(match.odom_T_body, query.odom_T_body)
+
+
+def _is_turned(pose: Array, query: Keyframe, match: Keyframe) -> bool:
     """Whether a pose `match_T_query` is turned round to what odometry has, or where there is none, to the match."""
-    if query.session == match.session and query.odom_T_body is not None and match.odom_T_body is not None:
-        pose = invert(relative(match.odom_T_body, query.odom_T_body)) @ pose
-    return abs(float(heading(pose))) > np.pi / 2
+    expected = _expected(query, match)
+    return abs(float(heading(pose if expected is None else relative(expected, pose)))) > np.pi / 2
