@@ -166,8 +166,14 @@ def test_clouds_that_are_none_are_one_line(tmp_path: Path) -> None:
         survey.write(tmp_path / f"good.{suffix}")
         np.testing.assert_allclose(read_points(tmp_path / f"good.{suffix}"), survey.xyz, atol=1e-3)
     wrong = {"cut.pcd": good.read_bytes()[:-50], "none.ply": b"ply\n", "few.ply": b"", "cloud.las": b"LASF"}
+    wrong["wide.pcd"] = write_cloud(tmp_path / "wide.pcd", 1e4 * points).read_bytes()
     for name, damaged in wrong.items():
         (tmp_path / name).write_bytes(damaged)
         done = umf("map", "import-cloud", tmp_path / name, "--out", tmp_path / "map")
         assert done.status == 1 and name in done.err and len(done.err.splitlines()) == 1, name
         assert not (tmp_path / "map").exists()
+    away = Trajectory(np.arange(3), np.stack([turned(x, 900.0, 0) for x in (0, 1, 2)]))
+    write_tum(tmp_path / "away.tum", away)
+    done = umf("map", "import-cloud", good, "--out", tmp_path / "map", "--trajectory", tmp_path / "away.tum")
+    assert done.status == 1 and "is the trajectory in its frame" in done.err
+    assert not (tmp_path / "map").exists() and not list(tmp_path.glob(".map*"))  # the next import may go there

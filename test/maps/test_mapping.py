@@ -145,13 +145,11 @@ def test_odometry_comes_from_a_file_of_its_name(tmp_path: Path, opening: Opening
     assert len(odometry) == len(path)
 
 
-@pytest.mark.parametrize(
-    ("left_out", "why"), [((ODOMETRY,), "vgicp"), ((ODOMETRY, CLOUD), "neither odometry nor scans")]
-)
+@pytest.mark.parametrize(("lacks", "why"), [((ODOMETRY,), "vgicp"), ((ODOMETRY, CLOUD), "neither odometry nor scans")])
 def test_a_recording_without_odometry_is_refused_before_it_is_replayed(
-    tmp_path: Path, opening: Opening, left_out: tuple[str, ...], why: str
+    tmp_path: Path, opening: Opening, lacks: tuple[str, ...], why: str
 ) -> None:
-    bag = write_mcap(tmp_path / "b.mcap", [entry for entry in traverse(3.0) if entry[0] not in left_out])
+    bag = write_mcap(tmp_path / "b.mcap", [entry for entry in traverse(3.0) if entry[0] not in lacks])
     with pytest.raises(BagError, match=why):
         replay_session(bag, opening, tmp_path / "blind")
     assert odometry_in(tmp_path / "blind") == []

@@ -324,9 +324,7 @@ def cut(cloud: Cloud, count: int, timed: bool, bands: bool) -> list[tuple[int, C
 @pytest.mark.parametrize("timed", [True, False])
 @pytest.mark.parametrize("bands", [True, False])
 @pytest.mark.parametrize(("count", "every_ms"), [(4, 100), (10, 100), (2, 100), (4, 250)])
-def test_parts_of_a_scan_are_joined(
-    calibration: Calibration, count: int, every_ms: int, bands: bool, timed: bool
-) -> None:
+def test_scan_parts_are_joined(calibration: Calibration, count: int, every_ms: int, bands: bool, timed: bool) -> None:
     synchronizer = Synchronizer(Sync(), calibration, {"cloud"})
     stream = [
         ("cloud", T0 + scan * every_ms * MS + start, part)

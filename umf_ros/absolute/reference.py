@@ -253,13 +253,11 @@ class AbsoluteReference:
         """Decide about the tracks; return whether the accepted factors have changed."""
         changed = False
         # gravity before GNSS: both determine the pose of the map in the world, GNSS more of it
-        for (session, source), track in sorted(
-            self._tracks.items(), key=lambda one: (one[0][1] is Aid.GNSS, one[0][0])
-        ):
+        for (session, aid), track in sorted(self._tracks.items(), key=lambda one: (one[0][1] is Aid.GNSS, one[0][0])):
             before = {cell: factor.numbers for cell, factor in track.factors.items()}
-            component, measured = paths.components[session], self._measured(source, track)
+            component, measured = paths.components[session], self._measured(aid, track)
             path = self._path(track, session, paths, at_last)
-            if source is Aid.GNSS and track.mounting is None and not self._has_gnss(component, paths):
+            if aid is Aid.GNSS and track.mounting is None and not self._has_gnss(component, paths):
                 world = track.align(measured, path)
                 if world is None:
                     continue

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -193,16 +194,16 @@ def export(
 
 @app.command("import-cloud")
 def import_cloud(
-    cloud: Annotated[Path, typer.Argument(help="Cloud of a map, .pcd or .ply: metres, z upwards.")],
+    cloud: Annotated[Path, typer.Argument(help="Cloud of a map, .pcd, .ply, .las or .laz: metres, z upwards.")],
     trajectory: Annotated[
         Path | None, typer.Option(help="TUM file: poses of the LiDAR in the cloud; else where a rover can stand.")
     ] = None,
     out: MapPath = Path("map"),
     config: options.ConfigPath = None,
-    fov: Annotated[float, typer.Option(min=20, max=360, help="Width that the LiDAR sees [deg].")] = 360.0,
-    low: Annotated[float, typer.Option(min=-89, max=0, help="Elevation of its lowest beam [deg].")] = -30.0,
-    high: Annotated[float, typer.Option(min=0, max=89, help="Elevation of its highest beam [deg].")] = 30.0,
-    height: Annotated[float, typer.Option(min=0.1, max=10, help="Its height above the ground [m].")] = 1.2,
+    fov: Annotated[float, typer.Option(min=20, max=360, help="Width that the LiDAR sees, deg.")] = 360.0,
+    low: Annotated[float, typer.Option(min=-89, max=0, help="Elevation of its lowest beam, deg.")] = -30.0,
+    high: Annotated[float, typer.Option(min=0, max=89, help="Elevation of its highest beam, deg.")] = 30.0,
+    height: Annotated[float, typer.Option(min=0.1, max=10, help="Its height above the ground, m.")] = 1.2,
 ) -> None:
     """Make a map of a point cloud of another program, to localise in with a LiDAR alone.
 
@@ -214,13 +215,15 @@ def import_cloud(
 
     from umf_ros.bags.trajectories import read_tum
     from umf_ros.core.config import load_settings
+    from umf_ros.core.io import check_writable
     from umf_ros.detector import make_detector_embedder
     from umf_ros.maps import cloud as clouds
     from umf_ros.maps.map_folder import MapFolder
 
     options.check_files(cloud, config, trajectory)
-    if out.exists() and any(out.iterdir()):
+    if out.is_file() or (out.is_dir() and any(out.iterdir())):
         raise ConfigError(f"{out} holds files already: import a cloud into a folder of its own; nothing was written")
+    check_writable(out.resolve().parent)
     console, settings = Console(), load_settings(config)
     lidar = clouds.VirtualLidar(fov, low, high, height_m=height)
     with Progress(console=console, transient=True) as bar:
@@ -230,11 +233,13 @@ def import_cloud(
         poses = clouds.along(read_tum(trajectory)) if trajectory else clouds.standing(points, height)
         headings = (0.0, 180.0) if trajectory else (0.0, 90.0, 180.0, 270.0)
         views, embedder = clouds.CloudViews(points, poses, headings, lidar), make_detector_embedder(settings)
-        target = MapFolder.open_or_create(out, settings)
         task = bar.add_task("Rendering places", total=len(poses) * len(headings))
-        count = clouds.import_cloud(target, cloud, views, embedder, lambda: bar.advance(task))
+        with TemporaryDirectory(prefix=f".{out.name}-", dir=out.resolve().parent) as beside:  # whole or not at all
+            target = MapFolder.open_or_create(Path(beside) / "map", settings)
+            count = clouds.import_cloud(target, cloud, views, embedder, lambda: bar.advance(task))
+            target.path.rename(out)
     console.print(f"{cloud}: {len(points)} points, {count} places", markup=False, highlight=False, soft_wrap=True)
-    _solve(target, console)
+    _solve(MapFolder.open(out), console)
 
 
 def _solve(target: MapFolder, console: Console) -> None:

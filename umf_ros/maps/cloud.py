@@ -35,7 +35,7 @@ _EXACT = np.diag([0.01, 0.01, 0.01, 0.002, 0.002, 0.002]) ** 2
 # visibility: side of the cells of a depth image, deg, and by how much a point may lie behind the nearest, of its range
 # and in m; points are so sparse near the LiDAR that wider cells close the gaps between them
 _FINE, _COARSE, _COARSE_M = (1.0, 1.05, 0.3), (3.0, 1.4, 0.5), 6.0
-_NEAREST_M, _FEWEST, _THIN_M = 0.5, 100, 0.1
+_NEAREST_M, _FEWEST, _THIN_M, _WIDEST_M = 0.5, 100, 0.1, 50_000.0
 # a rover stands where so many points are, few of them in its way above the ground, and no step is next to it
 _GROUND_POINTS, _GROUND_SHARE, _BODY_M, _IN_THE_WAY, _STEP_M = 20, 0.1, (0.4, 1.8), 0.05, 0.6
 
@@ -89,10 +89,12 @@ def thinned(points: Array, path: Path) -> Array:
     """Return one of the points (N, 3) of the cloud of a file in every cube of 10 cm.
 
     Raises:
-        UmfError: there are too few.
+        UmfError: there are too few, or they lie too far apart.
     """
     if len(points) < _FEWEST:
         raise UmfError(f"{path} holds {len(points)} points: too few for a map")
+    if (width_m := float(np.ptp(points, axis=0).max())) > _WIDEST_M:
+        raise UmfError(f"{path} is {width_m:.3g} m wide: is it in metres, without outliers?")
     return points[first_of_cubes(points, _THIN_M)]
 
 

@@ -76,10 +76,8 @@ class Sessions:
         late = [session for session, chain in enumerate(self.chains) if chain.update()]
         for session in self.begun:
             if session in late or session not in self.solved:
-                first = self.chains[session].stamps[:1].copy()
-                self.solved[session] = CorrectedPath(
-                    self.chains[session].at(first), self.chains[session].poses_at(first)
-                )
+                chain, first = self.chains[session], self.chains[session].stamps[:1].copy()
+                self.solved[session] = CorrectedPath(chain.at(first), chain.poses_at(first))
         if late:
             self._solver = GraphSolver()
         return bool(late)

@@ -19,9 +19,7 @@ from umf_ros.sensors.point_times import TIME_NAMES, PointTimes
 
 _COLOURS = {name: getattr(cv2, f"COLOR_{name.upper()}2GRAY") for name in ("rgb", "bgr", "rgba", "bgra")}
 # ROS names the upper left 2x2 pixels; the names of OpenCV's older constants start one pixel further
-_MOSAICS = {
-    f"bayer_{name}": getattr(cv2, f"COLOR_Bayer{name.upper()}2GRAY") for name in ("rggb", "bggr", "gbrg", "grbg")
-}
+_MOSAICS = {f"bayer_{one}": getattr(cv2, f"COLOR_Bayer{one.upper()}2GRAY") for one in ("rggb", "bggr", "gbrg", "grbg")}
 # encoding -> channels, bytes per channel, OpenCV's conversion to grey
 _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     **{name: (1, 1 if "8" in name else 2, None) for name in ("mono8", "8UC1", "mono16", "16UC1")},
