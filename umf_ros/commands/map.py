@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from shutil import copytree
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -223,7 +224,8 @@ def import_cloud(
     options.check_files(cloud, config, trajectory)
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         raise ConfigError(f"{out} holds files already: import a cloud into a folder of its own; nothing was written")
-    check_writable(out.resolve().parent)
+    beside = out if out.is_dir() else out.resolve().parent  # a folder there may be a link or a volume
+    check_writable(beside)
     console, settings = Console(), load_settings(config)
     lidar = clouds.VirtualLidar(fov, low, high, height_m=height)
     with Progress(console=console, transient=True) as bar:
@@ -234,10 +236,10 @@ def import_cloud(
         headings = (0.0, 180.0) if trajectory else (0.0, 90.0, 180.0, 270.0)
         views, embedder = clouds.CloudViews(points, poses, headings, lidar), make_detector_embedder(settings)
         task = bar.add_task("Rendering places", total=len(poses) * len(headings))
-        with TemporaryDirectory(prefix=f".{out.name}-", dir=out.resolve().parent) as beside:  # whole or not at all
-            target = MapFolder.open_or_create(Path(beside) / "map", settings)
+        with TemporaryDirectory(prefix=f".{out.name}-", dir=beside) as made:  # whole or not at all
+            target = MapFolder.open_or_create(Path(made) / "map", settings)
             count = clouds.import_cloud(target, cloud, views, embedder, lambda: bar.advance(task))
-            target.path.rename(out)
+            copytree(target.path, out, dirs_exist_ok=True)
     console.print(f"{cloud}: {len(points)} points, {count} places", markup=False, highlight=False, soft_wrap=True)
     _solve(MapFolder.open(out), console)
 
