@@ -166,9 +166,7 @@ def test_odometry_that_jumps_begins_a_chain_of_its_own_as_it_does_live(
 ) -> None:
     half, moved = len(stream) // 2, np.eye(4)
     moved[0, 3] = 500.0
-    later = [
-        item if item.odom_T_body is None else changed(item, odom_T_body=moved @ item.odom_T_body) for item in stream
-    ]
+    later = [one if one.odom_T_body is None else changed(one, odom_T_body=moved @ one.odom_T_body) for one in stream]
     replay = replay_of(folder, settings)
     list(replay.run([*stream[:half], *later[half:]]))
     replay.finish({})

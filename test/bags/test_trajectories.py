@@ -51,8 +51,8 @@ def test_tum_keeps_every_nanosecond_and_the_pose(tmp_path: Path) -> None:
         ("0.4 0 0 0 0 0 0 1", "not later than the one before"),
         ("nan 0 0 0 0 0 0 1", "expected numbers"),
         ("inf 0 0 0 0 0 0 1", "expected numbers"),
-        ("1e30 0 0 0 0 0 0 1", "beyond all"),
-        ("9223372037.0 0 0 0 0 0 0 1", "beyond all"),
+        ("1e30 0 0 0 0 0 0 1", "later than any time"),
+        ("9223372037.0 0 0 0 0 0 0 1", "later than any time"),
         ("1.0 0 0 0 0.1 0.2 0.3", "expected 8 numbers"),
     ],
 )

@@ -12,7 +12,7 @@ import pytest
 import rasterio
 import yaml
 from command_line import Ended, only_line, umf
-from recordings import part_of, traverse, write_mcap
+from recordings import CLOUD, ODOMETRY, part_of, traverse, write_mcap
 from sources import rows_of
 
 from umf_ros.bags.reader import open_bag
@@ -95,7 +95,7 @@ def test_a_map_that_was_cut_off_while_it_compared_goes_on(made: tuple[Path, Ende
     assert path.read_text() == before
 
 
-def wrong_calls(tmp_path: Path) -> Iterator[tuple[list[Path], str]]:
+def wrong_calls(tmp_path: Path) -> Iterator[tuple[list[object], str]]:
     (tmp_path / "empty").mkdir()
     yield [tmp_path / "missing.mcap"], "there is no recording"
     yield [tmp_path / "empty"], "empty is not a recording"
@@ -103,12 +103,16 @@ def wrong_calls(tmp_path: Path) -> Iterator[tuple[list[Path], str]]:
     yield [tmp_path / "notes.txt"], "notes.txt is not a recording"
     small = write_mcap(tmp_path / "small.mcap", traverse(0.3))
     yield [small, tmp_path / "notes.txt"], "notes.txt is not a recording"
+    yield [small, "--odometry", "foo"], "--odometry foo: there is no such file, and no engine but vgicp or none"
+    yield [small, "--odometry", "none"], "a map needs odometry"
+    blind = write_mcap(tmp_path / "blind.mcap", [one for one in traverse(0.3) if one[0] not in (CLOUD, ODOMETRY)])
+    yield [small, blind], "blind.mcap has neither odometry nor scans"
 
 
 def test_what_a_user_gets_wrong_is_one_line(tmp_path: Path) -> None:
     for recordings, told in wrong_calls(tmp_path):
         assert told in only_line(umf("map", *recordings, "--out", tmp_path / "map"))
-    assert not (tmp_path / "map").exists() or not list((tmp_path / "map").iterdir())
+    assert not (tmp_path / "map").exists()
 
 
 def test_a_rover_finds_itself_in_the_map_which_stays_as_it_is(
@@ -130,6 +134,8 @@ def test_a_rover_finds_itself_in_the_map_which_stays_as_it_is(
     assert len(rows) == about["located"] and all(float(row["probability"]) > 0.99 for row in rows)
     assert all(0 < float(row["sigma_x_m"]) < 1 for row in rows)
     assert {path: path.read_bytes() for path in before} == before
+    assert "localised in" in only_line(umf("judge", tmp_path / "latest"))  # closures between other clocks
+    assert f"Pose in the map known at {about['located']} of" in umf("report", tmp_path / "latest").out
     told = only_line(umf("replay", again, "--map", out, "--out", tmp_path / "none", "--resume"))
     assert told == "a localising run has no use for --resume" and not (tmp_path / "none").exists()
 

@@ -88,7 +88,7 @@ def test_the_command_that_continues_a_run(here: Path) -> None:
     assert (folder / NAME).exists()
     about = judge(read_run(folder), keep=False)
     findings = look_first(about)
-    assert conclude(about, findings).mark != "good"
+    assert conclude(about, findings).mark != "good" and "did not end; so far: " in umf("judge", folder).out
     (command,) = [one for finding in findings for one in printed(finding.remedy) if "--resume" in one]
     run_all([command])
     assert read_summary(folder)["interrupted"] is False

@@ -13,7 +13,7 @@ import pytest
 from conftest import make_keyframe
 from rich.console import Console
 
-from umf_ros.commands.console import WARNING, FrameProgress, stop_on_interrupt, undisturbed
+from umf_ros.commands.console import WARNING, FrameProgress, stop_on_interrupt, telling_interrupts, undisturbed
 from umf_ros.core.frames import Candidate, LoopClosure
 from umf_ros.detector import Detection
 from umf_ros.verification import Hypothesis
@@ -122,7 +122,15 @@ def test_where_there_is_no_terminal_no_bar_is_drawn() -> None:
     out = io.StringIO()
     with FrameProgress(Console(file=out)) as progress:
         progress.show(0.5, found(1, 1))
-    assert out.getvalue().strip() == ""
+    assert out.getvalue() == ""
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, SystemExit])
+def test_where_a_command_is_interrupted_it_says_what_is_left(end: type[BaseException]) -> None:
+    out = io.StringIO()
+    with pytest.raises(end), telling_interrupts(Console(file=out), "nothing was written"):
+        raise end
+    assert out.getvalue() == "Interrupted: nothing was written\n"
 
 
 @pytest.mark.parametrize("text", ["runs[old]/a.mcap breaks off", "[/x] is no tag", "a line " + "that is long " * 20])

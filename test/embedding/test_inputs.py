@@ -126,11 +126,8 @@ def test_only_padding_is_trimmed(counts):
 
 
 def test_a_blank_input_has_the_shapes_of_any_other():
-    blank, full = (
-        blank_input(TINY),
-        pack([np.ones(TINY.image_size, np.float32)], [prepare_scan(None, None, TINY)], TINY),
-    )
-    for empty, other in zip(blank, full, strict=True):
+    full = pack([np.ones(TINY.image_size, np.float32)], [prepare_scan(None, None, TINY)], TINY)
+    for empty, other in zip(blank_input(TINY), full, strict=True):
         assert empty.shape == other.shape and empty.dtype == other.dtype and not empty.any()
 
 

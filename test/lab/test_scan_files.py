@@ -172,11 +172,7 @@ PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float
         ("a.pcd", b"FIELDS x y z\nDATA ascii\n" + b"1 1 1\n" * 1_200_000, "numbers or more: split it"),
         ("a.pcd", b"FIELDS x y z\nDATA ascii\n" + b"1 1 1 " * 1_200_000, "numbers or more: split it"),
         ("a.pcd", b"FIELDS x y z a\nDATA ascii\n" + b"1 1 1 \xff\n" * 500_000, "numbers or more: split it"),
-        (
-            "a.pcd",
-            b"FIELDS x y z\nDATA binary_compressed\n" + struct.pack("<II", 9, 10**8) + bytes(9),
-            "more than 9 MB",
-        ),
+        ("a.pcd", b"FIELDS x y z\nDATA binary_compressed\n" + struct.pack("<II", 9, 10**8) + bytes(9), "than 9 MB"),
         ("a.pcd", b"FIELDS x y z\nDATA binary_compressed\n" + LONG_LZF, "or more, 1000 expected"),
         ("a.ply", b"ply\n" + b"\n" * 10**7, "more than 64 kB"),
         ("a.ply", PLY.replace("vertex 2", "vertex 4000000000").encode() + b"1 2 3\n", "break off before 4000000000"),

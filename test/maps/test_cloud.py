@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,6 +72,8 @@ def test_places_are_a_metre_apart_and_look_along_a_path_without_rotations() -> N
     steps = np.linalg.norm(np.diff(found[:, :3, 3], axis=0), axis=1)
     assert np.allclose(steps, 1.0, atol=0.15)
     assert np.allclose(np.arctan2(found[:, 1, 0], found[:, 0, 0]), np.pi / 4)
+    with pytest.raises(UmfError, match="3 poses within 1 m"):
+        along(Trajectory(np.arange(3), poses[:3]))
 
 
 def test_a_rover_stands_on_ground_not_in_walls_or_on_steps() -> None:
@@ -96,7 +99,8 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
         *("--config", folder / "config.yaml", "--out", folder / "map"),
     )
     assert done.status == 0, done.err
-    assert "30 places" in done.out and "15 found, 15 accepted" in done.out
+    summary = json.loads((folder / "map" / "summary.json").read_text())["closures_between"]
+    assert "30 places" in done.out and summary["accepted"] == summary["found"] == 15
     return folder / "map"
 
 

@@ -103,6 +103,8 @@ def test_results_are_listed_by_session(tmp_path: Path) -> None:
     poses = read_poses(folder.path)
     assert len(poses) == 61 + 71 and poses.stamps_ns[-1] == made[1].stamp(80) + DAY_NS
     draw_map(tmp_path / "without.png", replace(joint, between=[]))
+    standing = [replace(one, poses=np.tile(make_pose(np.eye(3), [0.3, 0, 0]), (2, 1, 1))) for one in joint.sessions]
+    draw_map(tmp_path / "standing.png", replace(joint, sessions=standing, within=[], between=[]))
     assert (folder.path / "trajectories.png").read_bytes() != (tmp_path / "without.png").read_bytes()  # draws closures
     page = (folder.path / "report.html").read_text()
     assert "2 of 2 sessions in one frame" in page and page.count("data:image/png") == 1  # no scans, no ground

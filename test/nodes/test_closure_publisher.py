@@ -174,12 +174,8 @@ def test_silence_where_there_is_nothing_to_say(talk: Talk) -> None:
     talk.announcer.announce(detection([]), {})  # the last word: what was sent before it has arrived
     talk.hear("/front_end/keyframes")
     heard = {topic: len(messages) for topic, messages in talk.heard.items()}
-    assert heard == {
-        "/loop_closures": 0,
-        "/front_end/keyframes": 1,
-        "/front_end/candidates": 1,
-        "/front_end/markers": 0,
-    }
+    sent = dict.fromkeys(("/front_end/keyframes", "/front_end/candidates"), 1)
+    assert heard == sent | dict.fromkeys(("/loop_closures", "/front_end/markers"), 0)
 
 
 def lines(marker: Marker) -> list[tuple[float, ...]]:

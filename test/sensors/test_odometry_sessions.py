@@ -193,9 +193,7 @@ def test_stamps_ahead_of_time_are_dropped(ahead_s: float, row: int, count: int) 
 
 @pytest.mark.parametrize("step_s", [1.5, 3600.0])
 def test_a_clock_that_is_set_ahead_and_stays_there_loses_no_message(step_s: float) -> None:
-    messages = [
-        (second + (step_s if second > 10 else 0), pose) for second, pose in samples(np.arange(0, 20, 0.04), lap)
-    ]
+    messages = [(at + (step_s if at > 10 else 0), pose) for at, pose in samples(np.arange(0, 20, 0.04), lap)]
     feed, sessions, told = fed(messages)
     assert (sessions, told, feed.dropped) == ([500], [], 0)
 

@@ -110,9 +110,7 @@ def test_interleaving_of_arrivals_changes_nothing(seed: int, calibration: Calibr
     rng = np.random.default_rng(seed)
     arrivals: list[tuple[float, Measurement]] = []
     for stream in streams.values():
-        delays = np.maximum.accumulate(
-            np.array([item[1] - T0 for item in stream]) + rng.uniform(0, 0.4 * S, len(stream))
-        )
+        delays = np.maximum.accumulate(np.array([one[1] - T0 for one in stream]) + rng.uniform(0, 0.4 * S, len(stream)))
         lag = rng.uniform(0, 0.5 * S)
         arrivals += [(delay + lag, item) for delay, item in zip(delays, stream, strict=True)]
     shuffled = [item for _, item in sorted(arrivals, key=lambda arrival: arrival[0])]

@@ -260,10 +260,8 @@ class Track:
         mapped = path.poses[:, :3, 3] + apply(path.poses, self._levers)
         world, here = (_Stretches.of(points, self._variances, path) for points in (measured, mapped))
         newest = slice(-_ALIGNED_STRETCHES, None)
-        ends = world.middles[newest], here.middles[newest]
-        direction = (
-            find_heading(*ends, world.spreads[newest], world.travel[newest], self._drift) if len(ends[0]) else None
-        )
+        ends, known = (world.middles[newest], here.middles[newest]), (world.spreads[newest], world.travel[newest])
+        direction = find_heading(*ends, *known, self._drift) if len(ends[0]) else None
         if direction is None:
             self._decide_all((State.PENDING, AbsoluteReason.NOT_ALIGNED))
             return None

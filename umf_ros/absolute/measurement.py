@@ -191,9 +191,8 @@ class AbsoluteDecoder:
 
     def _at_rest(self, message: Any, stamp_ns: int) -> tuple[Array, float] | None:
         """Return the direction of the mean acceleration over the last second, and its sigma, if the IMU was at rest."""
-        force, rate = (
-            [vector.x, vector.y, vector.z] for vector in (message.linear_acceleration, message.angular_velocity)
-        )
+        vectors = message.linear_acceleration, message.angular_velocity
+        force, rate = ([one.x, one.y, one.z] for one in vectors)
         if self._window and not 0 < stamp_ns - self._window[-1][0] < 10**9:
             self._window.clear()
         self._window.append((stamp_ns, np.array(force, float), np.array(rate, float)))

@@ -68,9 +68,8 @@ class _Heights:
     def verdict(self, stamp_ns: int, sigmas: float, misfit_m: float) -> AbsoluteVerdict:
         """Return the verdict on one height."""
         if not self.fits:
-            known = (
-                (State.PENDING, AbsoluteReason.UNSURE) if self.fits is None else (State.REJECTED, AbsoluteReason.MISFIT)
-            )
+            unsure, misfit = (State.PENDING, AbsoluteReason.UNSURE), (State.REJECTED, AbsoluteReason.MISFIT)
+            known = unsure if self.fits is None else misfit
         elif np.isnan(sigmas):
             known = State.REJECTED, AbsoluteReason.OUTSIDE
         elif sigmas > _HEIGHT_GATE:
@@ -277,13 +276,11 @@ class AbsoluteReference:
         chain = paths.chains[session]
         points = chain.at(track.stamps)
 
-        def at_middle(cell: int) -> tuple[int, Array]:
+        def middle(cell: int) -> tuple[int, Array]:
             point = chain.at(_middle(chain, cell))
             return int(point["stamp"][0]), point["pose"][0]
 
-        return MeasuredPath(
-            points["pose"], paths.at(points), points["travel"], _finished(chain)[0] + at_last, at_middle
-        )
+        return MeasuredPath(points["pose"], paths.at(points), points["travel"], _finished(chain)[0] + at_last, middle)
 
     def _measured(self, source: Aid, track: Track) -> Array:
         """Return (N, 3) positions in the world, or upward directions in the body."""
@@ -398,9 +395,8 @@ def _attached(track: Track, session: int, points: NDArray[np.void]) -> Factors:
     before = middles - travel[after - 1] < travel[after.clip(max=len(own) - 1)] - middles
     rows = own[np.where(before, after - 1, after.clip(max=len(own) - 1))]
     poses = invert(points["pose"][rows]) @ np.array([one.middle for one in factors.values()]).reshape(-1, 4, 4)
-    return [
-        (row, partial(one.make, pose)) for row, pose, one in zip(rows.tolist(), poses, factors.values(), strict=True)
-    ]
+    placed = zip(rows.tolist(), poses, factors.values(), strict=True)
+    return [(row, partial(one.make, pose)) for row, pose, one in placed]
 
 
 def _finished(chain: OdometryChain) -> tuple[int, int]:

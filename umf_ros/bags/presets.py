@@ -72,9 +72,7 @@ def settings_for(bag: Bag, config: ParameterSource, dataset: str, **overrides: A
     except BagError as error:
         has_transforms = transform_topics(bag.types) or transform_topics(bag.types, MOVING_TOPIC)
         if not settings.calibration and not has_transforms:
-            advice = (
-                f"the parameter calibration names a file, and umf inspect {bag.path} --write config writes a first one"
-            )
+            advice = f"the parameter calibration names a file, and umf inspect {bag.path} --write config writes one"
             text = f"{error}, and without {TRANSFORMS_TOPIC} the mountings of its sensors are unknown; {advice}"
             raise BagError(text) from None
         return with_topics(settings, bag.types)

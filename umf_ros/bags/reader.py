@@ -386,12 +386,10 @@ def _overlapping(files: Iterable[RecordedFile]) -> list[list[RecordedFile]]:
     filled = [file for file in files if file.counts.total()]
     groups: list[list[RecordedFile]] = []
     for file in sorted(filled, key=lambda one: one.start_ns):
-        together = [one for one in groups[-1] if file.start_ns < one.end_ns] if groups else []
-        if any(
-            one.counts.keys() == file.counts.keys() for one in together if _common_ns(one, file) > SORTING_WINDOW_NS
-        ):
+        others = [one for one in groups[-1] if file.start_ns < one.end_ns] if groups else []
+        if any(one.counts.keys() == file.counts.keys() for one in others if _common_ns(one, file) > SORTING_WINDOW_NS):
             return [[one] for one in filled]
-        if together:
+        if others:
             groups[-1].append(file)
         else:
             groups.append([file])

@@ -92,7 +92,8 @@ def _as_trajectory(path: str | Path, found: list[tuple[int, Decimal, list[float]
     stamps, values = [int(stamp * unit) for _, stamp, _ in kept], np.array([row for *_, row in kept])
     for (number, stamp, _), before, now in zip(kept, [-LAST_STAMP_NS, *stamps], stamps, strict=False):
         if not before < now < LAST_STAMP_NS:
-            raise BagError(f"{path}, line {number}: the stamp {stamp} is not later than the one before, or beyond all")
+            why = "is not later than the one before" if now <= before else "is later than any time of ROS"
+            raise BagError(f"{path}, line {number}: the stamp {stamp} {why}")
     positions, turns = values[:, :3], values[:, 3:]
     if not turns.any() or (len(turns) > FEW_POSES and not np.ptp(turns, axis=0).any()):
         poses = RigidTransform.from_translation(positions).as_matrix()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -17,6 +20,11 @@ FAINT = 10.0
 """Added to the length of a cell's histogram: noise on a flat wall stays quiet."""
 
 
+def _embedding(source: Any, describe: Callable[[Any], Array], numbers: int) -> Embedding:
+    """Return the descriptor of an image or a scan; zeros without one."""
+    return Embedding(unit_descriptor(np.zeros(numbers) if source is None else describe(source)))
+
+
 class GradientsEmbedder:
     """Histograms of oriented gradients [Dalal 2005] in the cells of the whole image, each of unit length."""
 
@@ -25,9 +33,7 @@ class GradientsEmbedder:
 
     def embed(self, frame: Frame) -> Embedding:
         """Descriptor of the image; the same for every frame without one."""
-        return Embedding(
-            unit_descriptor(_histograms(frame.left) if frame.left is not None else np.zeros(self.dimension))
-        )
+        return _embedding(frame.left, _histograms, self.dimension)
 
 
 def _histograms(image: Image) -> Array:
@@ -56,10 +62,8 @@ class SolidEmbedder:
 
     def embed(self, frame: Frame) -> Embedding:
         """Descriptor of the scan; the same for every frame without one."""
-        if frame.points is None:
-            return Embedding(unit_descriptor(np.zeros(self.dimension)))
-        seen = transform(invert(frame.body_T_lidar), frame.points).astype(np.float32)
-        return Embedding(unit_descriptor(self._describe(seen)))
+        seen = None if frame.points is None else transform(invert(frame.body_T_lidar), frame.points).astype(np.float32)
+        return _embedding(seen, self._describe, self.dimension)
 
     def _describe(self, points: Points) -> Points:
         flat = np.hypot(points[:, 0], points[:, 1])
@@ -87,9 +91,7 @@ class ScanContextEmbedder:
 
     def embed(self, frame: Frame) -> Embedding:
         """Descriptor of the scan; the same for every frame without one."""
-        return Embedding(
-            unit_descriptor(self._context(frame.points) if frame.points is not None else np.zeros(self.dimension))
-        )
+        return _embedding(frame.points, self._context, self.dimension)
 
     def _context(self, points: Points, reach_m: float = 60.0, half_width: float = 0.61) -> Points:
         ring = (np.hypot(points[:, 0], points[:, 1]) / reach_m * self.rings).astype(int)
@@ -112,9 +114,7 @@ class ThumbnailEmbedder:
 
     def embed(self, frame: Frame) -> Embedding:
         """Descriptor of the image; the same for every frame without one."""
-        return Embedding(
-            unit_descriptor(_thumbnail(frame.left) if frame.left is not None else np.zeros(self.dimension))
-        )
+        return _embedding(frame.left, _thumbnail, self.dimension)
 
 
 def _thumbnail(image: Image) -> Points:

@@ -54,6 +54,7 @@ class LineProgress(Progress):
     def __init__(self, console: Console, what: str) -> None:
         columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[found]}")
         super().__init__(*columns, TimeRemainingColumn(), console=console, transient=True)
+        self.disable = not console.is_terminal  # else it leaves blank lines there
         self._task = self.add_task(what, total=1.0, found="")
         self._what, self._told_s = what, time.monotonic()
 
@@ -108,6 +109,16 @@ def stop_on_interrupt() -> Iterator[Callable[[], int]]:
 
     with _handled_by(remember) as before:
         yield lambda: signals[0] if signals else 0
+
+
+@contextmanager
+def telling_interrupts(console: Console, what: str) -> Iterator[None]:
+    """Print what is left of the work where Ctrl-C or SIGTERM ends it."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit):  # typer's own exits are none
+        console.print(f"Interrupted: {what}", **WARNING)
+        raise
 
 
 def undisturbed() -> AbstractContextManager[object]:

@@ -23,9 +23,11 @@ def command(folder: Annotated[Path, typer.Argument(help="A run folder, such as r
 
     with waiting(Console(), "Judging the closures"):
         from umf_ros.runs.self_check import TABLE, check_run
+        from umf_ros.runs.writer import read_summary
 
+        is_cut = not (folder / "summary.json").is_file() or bool(read_summary(folder).get("interrupted"))
         found = check_run(folder)
         found.write(folder / TABLE)
     for row in found.doubted:
         typer.echo(f"doubted: {found.describe(row)}")
-    typer.echo(f"{folder}: {found.sentence}")
+    typer.echo(f"{folder}: {'the run did not end; so far: ' if is_cut else ''}{found.sentence}")

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from umf_ros.commands import recordings as options
-from umf_ros.core.errors import ConfigError
+from umf_ros.core.errors import ConfigError, command_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,14 +30,11 @@ RayAddress = Annotated[
 ]
 MapPath = Annotated[Path, typer.Option("--out", help="Folder of the map, new or one to add to.")]
 OdometryFolder = Annotated[
-    Path | None,
-    typer.Option("--odometry", help="Folder of TUM files named like recordings; else their own, or that of scans."),
+    str | None,
+    typer.Option("--odometry", metavar="FOLDER|ENGINE", help="TUM files named like recordings; vgicp: of the scans."),
 ]
 
-
-Pair = Annotated[
-    tuple[int, int] | None, typer.Option(metavar="MATCH QUERY", help="Closure by the stamps of its keyframes.")
-]
+Pair = Annotated[tuple[int, int] | None, typer.Option(metavar="MATCH QUERY", help="Closure by its keyframes' stamps.")]
 
 
 class _MakeOrChange(TyperGroup):
@@ -78,14 +75,16 @@ def command(
 
     Every recording is a session with its own odometry; closures within and between them make one pose graph.
     Recordings that are in the map already are skipped, so only new ones take time.
+    A map without closures, as of a drive that never returns, is one to localise in.
     """
-    options.check_files(recordings[0], config, odometry)
-    odometry_frame = options.check_odometry_options(odometry, odometry_frame)
+    chosen = options.ChosenOdometry.parse(odometry, odometry_frame)
+    if odometry == "none":
+        raise ConfigError("--odometry none: a map needs odometry; umf replay does without")
+    options.check_files(recordings[0], config)
 
     from rich.console import Console
-    from rich.progress import track
 
-    from umf_ros.commands.console import waiting
+    from umf_ros.commands.console import LineProgress, telling_interrupts, waiting
 
     console = Console()
     with waiting(console, "Opening the recordings"):
@@ -95,22 +94,25 @@ def command(
         from umf_ros.maps.map_folder import MapFolder
         from umf_ros.maps.mapping import Opening, find_recordings, match_session, unmatched
 
-        check_writable(out)
-        parameters = options.parameters(config, changes)
-        opening = Opening(parameters, dataset, embedder, str(weights) if weights else None, odometry, odometry_frame)
+        files = options.parameters(config, changes), dataset, embedder, str(weights) if weights else None
+        opening = Opening(*files, chosen.path, chosen.frame, chosen.engine if chosen.is_wanted else "")
         bags = [open_bag(one) for one in find_recordings(recordings)]  # before there is a folder
+        for bag in bags:
+            opening.check(bag)
+        check_writable(out)
         target = MapFolder.open_or_create(out, opening.settings(bags[0]))
     new = _new_recordings(target, bags, console)
-    if ray is None and workers == 1:
-        for name, recording in new.items():
-            _add(target, name, recording, opening, console)
-    else:
-        _add_all(target, new, opening, partial(spread, workers=workers, ray=ray), console)
-    for session in unmatched(target):
-        title = f"Matching {session.name} with the map"
-        for _ in track(match_session(target, session), title, session.places, console=console, transient=True):
-            pass
-    _solve(target, console)
+    with telling_interrupts(console, "the same command continues from here"):
+        if ray is None and workers == 1:
+            for name, recording in new.items():
+                _add(target, name, recording, opening, console)
+        else:
+            _add_all(target, new, opening, partial(spread, workers=workers, ray=ray), console)
+        for session in unmatched(target):
+            with LineProgress(console, f"Matching {session.name} with the map") as progress:
+                for done, _ in enumerate(match_session(target, session), 1):
+                    progress.advance_to(done / session.places)
+        _print_summary(out, _solve(target, console), console)
 
 
 @app.command("edit")
@@ -199,7 +201,7 @@ def import_cloud(
     trajectory: Annotated[
         Path | None, typer.Option(help="TUM file: poses of the LiDAR in the cloud; else where a rover can stand.")
     ] = None,
-    out: MapPath = Path("map"),
+    out: Annotated[Path, typer.Option("--out", help="Folder of the map, new or empty.")] = Path("map"),
     config: options.ConfigPath = None,
     fov: Annotated[float, typer.Option(min=20, max=360, help="Width that the LiDAR sees, deg.")] = 360.0,
     low: Annotated[float, typer.Option(min=-89, max=0, help="Elevation of its lowest beam, deg.")] = -30.0,
@@ -209,49 +211,56 @@ def import_cloud(
     """Make a map of a point cloud of another program, to localise in with a LiDAR alone.
 
     Places are views of the LiDAR rendered out of the cloud, along the trajectory in both directions, or every two
-    metres in four.
+    metres in four: a tenth of a second each.
     """
+    options.check_files(Path(), cloud, config, trajectory)
+
     from rich.console import Console
-    from rich.progress import Progress
 
     from umf_ros.bags.trajectories import read_tum
+    from umf_ros.commands.console import PLAIN, LineProgress, telling_interrupts, waiting
     from umf_ros.core.config import load_settings
     from umf_ros.core.io import check_writable
     from umf_ros.detector import make_detector_embedder
     from umf_ros.maps import cloud as clouds
     from umf_ros.maps.map_folder import MapFolder
 
-    options.check_files(cloud, config, trajectory)
-    if out.is_file() or (out.is_dir() and any(out.iterdir())):
+    if out.is_dir() and any(out.iterdir()):
         raise ConfigError(f"{out} holds files already: import a cloud into a folder of its own; nothing was written")
     beside = out if out.is_dir() else out.resolve().parent  # a folder there may be a link or a volume
-    check_writable(beside)
+    check_writable(out if out.exists() else beside)
     console, settings = Console(), load_settings(config)
     lidar = clouds.VirtualLidar(fov, low, high, height_m=height)
-    with Progress(console=console, transient=True) as bar:
-        bar.add_task("Reading the cloud", total=None)
+    with waiting(console, "Reading the cloud"):
         read_points = import_module("umf_ros.lab.scan_files").read_points  # by name, as commands of the lab are
         points = clouds.thinned(read_points(cloud), cloud)
         poses = clouds.along(read_tum(trajectory)) if trajectory else clouds.standing(points, height)
         headings = (0.0, 180.0) if trajectory else (0.0, 90.0, 180.0, 270.0)
         views, embedder = clouds.CloudViews(points, poses, headings, lidar), make_detector_embedder(settings)
-        task = bar.add_task("Rendering places", total=len(poses) * len(headings))
-        with TemporaryDirectory(prefix=f".{out.name}-", dir=beside) as made:  # whole or not at all
-            target = MapFolder.open_or_create(Path(made) / "map", settings)
-            count = clouds.import_cloud(target, cloud, views, embedder, lambda: bar.advance(task))
-            copytree(target.path, out, dirs_exist_ok=True)
-    console.print(f"{cloud}: {len(points)} points, {count} places", markup=False, highlight=False, soft_wrap=True)
-    _solve(MapFolder.open(out), console)
+    told = f"{len(points)} points 10 cm apart; views from {len(poses)} positions in {len(headings)} directions"
+    console.print(f"{cloud}: {told}", **PLAIN)
+    with (
+        telling_interrupts(console, "nothing was written"),
+        LineProgress(console, "Rendering views") as progress,
+        TemporaryDirectory(prefix=f".{out.name}-", dir=beside) as made,  # whole or not at all
+    ):
+        target = MapFolder.open_or_create(Path(made) / "map", settings)
+        count = clouds.import_cloud(target, cloud, views, embedder, progress.advance_to)
+        copytree(target.path, out, dirs_exist_ok=True)
+    summary = _solve(MapFolder.open(out), console)
+    console.print(f"{out}: {count} places", **PLAIN)
+    _print_files(out, summary, console)
+    console.print(f"next: {command_line('replay', 'BAG', '--map', out)}", **PLAIN)
 
 
-def _solve(target: MapFolder, console: Console) -> None:
-    """Solve the graph of a map, write its results and print them."""
+def _solve(target: MapFolder, console: Console) -> dict[str, Any]:
+    """Solve the graph of a map and write its results; return their summary."""
+    from umf_ros.commands.console import waiting
     from umf_ros.maps.joint_graph import solve
     from umf_ros.maps.outputs import write_results
 
-    with console.status("Solving the joint graph"):
-        summary = write_results(target, solve(target))
-    _print_summary(target.path, summary, console)
+    with waiting(console, "Solving the joint graph"):
+        return write_results(target, solve(target))
 
 
 def _new_recordings(target: MapFolder, bags: list[Bag], console: Console) -> dict[str, Path]:
@@ -276,21 +285,18 @@ def _add_all(
     target: MapFolder, new: dict[str, Path], opening: Opening, spread: Callable[..., None], console: Console
 ) -> None:
     """Replay all recordings in parallel, then match each with the earlier ones; the map is the same as in sequence."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
+    from umf_ros.commands.console import LineProgress
     from umf_ros.maps.mapping import add_session, match_task, replay_task, unmatched
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("recordings")
-    with Progress(*columns, console=console, transient=True) as progress:
+    def run(what: str, work: Callable[..., None], tasks: list[tuple[Any, ...]]) -> None:
+        total = len(tasks)
+        with LineProgress(console, what) as progress:
+            spread(work, tasks, done=lambda n: progress.advance_to(n / total, f"{n} of {total} recordings"))
 
-        def run(what: str, work: Callable[..., None], tasks: list[tuple[Any, ...]]) -> None:
-            bar = progress.add_task(what, total=len(tasks))
-            spread(work, tasks, done=lambda count: progress.update(bar, completed=count))
-
-        run("Replaying", replay_task, [(recording, opening, target.folder_of(name)) for name, recording in new.items()])
-        for name, recording in new.items():
-            add_session(target, name, recording)
-        run("Matching with the map", match_task, [(target.path, session) for session in unmatched(target)])
+    run("Replaying", replay_task, [(recording, opening, target.folder_of(name)) for name, recording in new.items()])
+    for name, recording in new.items():
+        add_session(target, name, recording)
+    run("Matching with the map", match_task, [(target.path, session) for session in unmatched(target)])
 
 
 def _add(target: MapFolder, name: str, recording: Path, opening: Opening, console: Console) -> None:
@@ -316,6 +322,12 @@ def _print_summary(out: Path, summary: dict[str, Any], console: Console) -> None
         console.print(f"  {one['name']}: {size}{told}", markup=False, soft_wrap=True)
         for finding in one.get("findings", []):
             console.print(f"    {finding}", **WARNING)
-    files = f"{out}: {summary['ground']}" if summary.get("ground") else ""
-    for line in filter(None, (f"{out}: {sentence(summary)}", crispness(summary), files, f"{out / 'report.html'}")):
+    for line in filter(None, (f"{out}: {sentence(summary)}", crispness(summary))):
+        console.print(line, markup=False, soft_wrap=True)
+    _print_files(out, summary, console)
+
+
+def _print_files(out: Path, summary: dict[str, Any], console: Console) -> None:
+    files = [f"{out}: {summary['ground']}"] if summary.get("ground") else []
+    for line in (*files, f"{out / 'report.html'}"):
         console.print(line, markup=False, soft_wrap=True)

@@ -135,8 +135,9 @@ class ChosenOdometry:
     @classmethod
     def parse(cls, choice: str | None, frame: str) -> ChosenOdometry:
         """Return the choice of `--odometry` and `--odometry-frame`; raise a `ConfigError` if they do not fit."""
-        is_file = choice is not None and (choice not in (*ENGINES, "none") or Path(choice).exists())
-        path = Path(choice) if choice and is_file else None
+        path = Path(choice) if choice and Path(choice).exists() else None
+        if choice is not None and path is None and choice not in (names := (*ENGINES, "none")):
+            raise ConfigError(f"--odometry {choice}: there is no such file, and no engine but {either(names)}")
         engine = "" if path or choice == "none" else choice or ENGINES[0]
         return cls(path, check_odometry_options(path, frame), engine, choice is not None)
 

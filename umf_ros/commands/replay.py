@@ -22,9 +22,7 @@ Resume = Annotated[bool, typer.Option("--resume", help="Continue the newest inte
 RerunPath = Annotated[Path | None, typer.Option("--rerun", help="Also log the run for the Rerun viewer: an .rrd file.")]
 Viewer = Annotated[bool, typer.Option("--viewer", help="Show the run in the Rerun viewer while it runs.")]
 Mode = Annotated[str | None, typer.Option("--mode", help="mapping, or localization in the map that --map names.")]
-MapPath = Annotated[
-    Path | None, typer.Option("--map", help="Map made by umf map to localise in; implies --mode localization.")
-]
+MapPath = Annotated[Path | None, typer.Option("--map", help="Map to localise in; implies --mode localization.")]
 
 
 def command(
@@ -54,7 +52,7 @@ def command(
     options.refuse_unused("a mapping run", {"--map": mode == "mapping" and map_folder})
     options.refuse_unused("a run in the viewer", {"--rerun": live and rerun})
     chosen = options.ChosenOdometry.parse(odometry, odometry_frame)
-    options.check_files(bag, config, chosen.path, ground_truth)
+    options.check_files(bag, config, ground_truth)
     options.check_map(map_folder)
 
     from rich.console import Console
@@ -73,14 +71,16 @@ def command(
             mode=mode or ("localization" if map_folder else None),
             map=str(map_folder) if map_folder else None,
         )
+        from umf_ros.core.io import check_folder, create_run_folder
         from umf_ros.detector import LoopDetector, make_detector_embedder
+
+        check_folder(out)
 
         # the network is compiled while the rest is imported
         starting = ThreadPoolExecutor(1, "start").submit(make_detector_embedder, settings)
         from umf_ros.bags.frames import FrameReader
         from umf_ros.bags.inputs import absent_inputs, input_counts
         from umf_ros.bags.trajectories import read_ground_truth
-        from umf_ros.core.io import create_run_folder
         from umf_ros.core.resources import MADE_ODOMETRY
         from umf_ros.core.watchdog import watching
         from umf_ros.replay import Replay

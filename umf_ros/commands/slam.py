@@ -3,16 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from umf_ros.commands import map as maps
 from umf_ros.commands import recordings as options
-
-OdometryFile = Annotated[
-    Path | None, typer.Option("--odometry", help="Odometry as a TUM file; else the recording's, or that of the scans.")
-]
 
 
 def command(
@@ -23,12 +16,11 @@ def command(
     dataset: options.DatasetName = "auto",
     embedder: options.EmbedderName = None,
     weights: options.WeightsPath = None,
-    odometry: OdometryFile = None,
+    odometry: options.OdometryChoice = None,
     odometry_frame: options.OdometryFrame = "",
 ) -> None:
     """Make a map of one recording: odometry, loop closures, pose graph and ground in one command.
 
     Scans alone are enough. The same command continues where it was killed; umf map adds further recordings.
     """
-    options.check_files(bag, config, odometry)
     maps.command([bag], out, config, changes, dataset, embedder, weights, 1, None, odometry, odometry_frame)

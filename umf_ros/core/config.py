@@ -79,9 +79,7 @@ class DatasetPreset(Group):
 class Qos(Group):
     """Quality of service of the sensor subscriptions."""
 
-    reliability: Literal["best_effort", "reliable"] = Field(
-        "best_effort", description="best_effort matches every publisher"
-    )
+    reliability: Literal["best_effort", "reliable"] = Field("best_effort", description="best_effort fits any publisher")
     depth: int = Field(50, ge=1, le=1000, description="messages queued per subscription; covers a busy second")
 
 
@@ -89,9 +87,7 @@ class Sync(Group):
     """Synchronisation of messages into frames."""
 
     slop_s: float = Field(0.05, gt=0, le=1, description="largest time difference between image and scan, s")
-    max_wait_s: float = Field(
-        1.0, gt=0, le=10, description="stream time after which a scan stops waiting for a late input, s"
-    )
+    max_wait_s: float = Field(1.0, gt=0, le=10, description="stream time that a scan waits for a late input, s")
     queue_size: int = Field(60, ge=2, le=1000, description="messages buffered per input at most")
     odometry_buffer_s: float = Field(10.0, gt=0, le=600, description="odometry kept for interpolation, s")
     max_odometry_gap_s: float = Field(1.0, gt=0, le=60, description="longest odometry gap that is interpolated, s")
@@ -144,9 +140,7 @@ class Verification(Group):
         "xfeat", description="local features of images: XFeat's, or those of the embedding network"
     )
     modalities: Literal["both", "image", "cloud"] = Field("both", description="local features that reranking uses")
-    rerank_features: int = Field(
-        200, ge=20, le=2000, description="strongest features per modality that reranking matches"
-    )
+    rerank_features: int = Field(200, ge=20, le=2000, description="strongest features per modality for reranking")
     ransac_iterations: int = Field(100, ge=10, le=5000, description="iterations of every RANSAC")
     refine_best: int = Field(4, ge=1, le=50, description="reranked candidates whose metric pose is estimated")
     max_closures: int = Field(1, ge=1, le=50, description="closures published per keyframe at most")
@@ -168,22 +162,16 @@ class PoseGraphSettings(Group):
     odometry_sigma_deg: float = Field(0.5, gt=0, description="odometry noise after one metre (random walk), deg")
     max_closure_m: float = Field(100.0, gt=0, description="translation beyond which a closure is refused, m")
     max_correction_m: float = Field(0.0, ge=0, description="largest correction of a pose by a closure, m; 0: no limit")
-    gate_chi2: float = Field(
-        27.9, gt=0, description="largest squared Mahalanobis distance to the map (6 degrees of freedom)"
-    )
+    gate_chi2: float = Field(27.9, gt=0, description="largest squared Mahalanobis distance to the map (6 d.o.f.)")
     pair_chi2: float = Field(33.6, gt=0, description="largest squared Mahalanobis distance between consistent closures")
     alias_radius_m: float = Field(15.0, gt=0, description="radius of wrong closures to similar places, m")
-    max_chance: float = Field(
-        0.02, gt=0, le=1, description="largest false-alarm probability of a closure accepted at once"
-    )
+    max_chance: float = Field(0.02, gt=0, le=1, description="largest false-alarm probability of acceptance at once")
     min_support: float = Field(
         8.0, ge=0, description="evidence that closures of several places need, nats; each further place gives up to 4"
     )
     place_m: float = Field(10.0, ge=0, description="path length within which closures count as one place, m")
     support_range_m: float = Field(80.0, gt=0, description="path length within which closures are compared, m")
-    patience_m: float = Field(
-        60.0, ge=0, description="path length after which an uncontradicted closure is accepted, m"
-    )
+    patience_m: float = Field(60.0, ge=0, description="path after which an uncontradicted closure is accepted, m")
     max_pending_s: float = Field(30.0, gt=0, description="longest wait of a closure for its odometry, stream time, s")
     origin: str = Field(
         "", description="latitude, longitude (deg) and height (m) of the world frame; empty: the first good GNSS fixes"
@@ -255,9 +243,7 @@ class Database(Group):
     server: Annotated[str, AfterValidator(without_password)] = Field(
         "", description="fleet server, postgresql://ROVER@HOST/DATABASE; the password is in ~/.pgpass or PGPASSWORD"
     )
-    fleet_candidates: int = Field(
-        5, ge=1, le=50, description="places of other rovers per keyframe passed to verification"
-    )
+    fleet_candidates: int = Field(5, ge=1, le=50, description="places of other rovers per keyframe to verify")
 
 
 class WorkerSettings(Group):

@@ -79,12 +79,19 @@ def write_atomically(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
+def check_folder(folder: Path) -> None:
+    """Raise an `OutputError` if there is something that is no folder."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"cannot write to {folder}: it is no folder")
+
+
 def check_writable(folder: Path) -> None:
     """Make a folder and check that results can be written into it, before hours of work.
 
     Raises:
         OutputError: it cannot be written.
     """
+    check_folder(folder)
     with writing(f"to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK):
@@ -112,8 +119,8 @@ def plain_name(text: str) -> str:
 def create_run_folder(out: Path, latest: bool = True) -> Path:
     """Make a new folder inside `out`, named after the local time; `out/latest` links to it unless `latest` is false."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    check_writable(out)
     with writing(f"to {out}"):
-        out.mkdir(parents=True, exist_ok=True)
         for number in count(1):
             folder = out / (stamp if number == 1 else f"{stamp}_{number}")
             with suppress(FileExistsError):

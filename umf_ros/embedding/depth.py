@@ -96,17 +96,14 @@ def _lidar_depths(frame: Frame, pixels: Points) -> Array:
     if frame.points is None or not len(frame.points) or not len(pixels):
         return unknown
     camera = frame.camera
-    where, depth = camera.project(frame.points, frame.body_T_camera)
+    at, depth = camera.project(frame.points, frame.body_T_camera)
     reach = camera.width / 90  # two rows of S3LI's scan
-    seen = (
-        (depth > 0.3)
-        & (where > -reach).all(axis=1)
-        & (where < [camera.width + reach, camera.height + reach]).all(axis=1)
-    )
-    where, depth = where[seen], depth[seen]
+    most = camera.width + reach, camera.height + reach
+    seen = (depth > 0.3) & (at > -reach).all(axis=1) & (at < most).all(axis=1)
+    at, depth = at[seen], depth[seen]
     if len(depth) < NEIGHBOURS:
         return unknown
-    distance, index = cKDTree(where, balanced_tree=False, compact_nodes=False).query(
+    distance, index = cKDTree(at, balanced_tree=False, compact_nodes=False).query(
         pixels, k=NEIGHBOURS, distance_upper_bound=reach
     )
     found = np.isfinite(distance)

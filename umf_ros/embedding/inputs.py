@@ -74,9 +74,8 @@ def voxelise(points: Points, intensity: Points | None, coarse_limit: int, fine_l
     means = np.stack([_mean(flat, values, occupied, weight) for values in (*cells.T, _brightness(intensity, inside))])
     grid = _fold(occupied, _features(occupied, means))
     fine = _most(occupied, count[occupied], fine_limit)
-    coarse, points_in = np.unique(
-        np.ravel_multi_index(tuple(_corner(occupied) // 4), (CELLS // 4,) * 3), return_inverse=True
-    )
+    coarse_of = np.ravel_multi_index(tuple(_corner(occupied) // 4), (CELLS // 4,) * 3)
+    coarse, points_in = np.unique(coarse_of, return_inverse=True)
     kept = _most(coarse, np.bincount(points_in, weights=weight, minlength=len(coarse)), coarse_limit)
     centroids = np.zeros((fine_limit, 3), np.float32)
     rows = np.searchsorted(occupied, fine)

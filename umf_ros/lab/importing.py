@@ -252,7 +252,9 @@ def folder(source: Path) -> Imported:
             (found.right if "right" in name.lower() else found.left).append((stamp, path))
     for files in (found.left, found.right, found.scans):
         files.sort(key=lambda one: one[0])
-    if not found.check(source).left:
+    if not found.left and not found.scans:
+        raise SensorFileError(f"{source / 'times.txt'} names neither images nor scans: expected lines FILE SECONDS")
+    if not found.left:
         return found  # the body is the LiDAR
     found.guessed = ["the intrinsics of the camera", "the mountings of camera and LiDAR"]
     width, height = size_of(found.left[0][1])
@@ -335,7 +337,10 @@ def open_data_set(source: Path) -> DataSetFile:
     """
     kind = next((kind for kind, (_, marks) in FORMATS.items() if all(any(source.glob(one)) for one in marks)), "")
     if not kind:
-        raise BagError(f"{source} is not a recording: it holds neither mcap nor db3 files, nor a known data set")
+        endings = {one.suffix.lower() for pattern in ("*", "*/*") for one in source.glob(pattern)}
+        has_files = not endings.isdisjoint((*SUFFIXES, *IMAGE_SUFFIXES))
+        hint = "; scans and images need a times.txt of lines FILE SECONDS" if has_files else ""
+        raise BagError(f"{source} is not a recording: it holds neither mcap nor db3 files, nor a known data set{hint}")
     found = FORMATS[kind][0](source)
     if found.guessed or "raw_camera" in found.camera:
         command = command_line("import", kind, source, f"{source.name}.mcap")

@@ -106,7 +106,7 @@ def _read(path: Path, take: Callable[[Columns], Taken], kind: int | Record = 0) 
     """Return what `take` makes of the columns of a file; a .bin holds `kind` float32 per point, or such records."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise SensorFileError(f"{path} is no scan: expected {either(SUFFIXES)}")
+        raise SensorFileError(f"{path} is no cloud of points: expected {either(SUFFIXES)}")
     try:
         check_size(path.stat().st_size, "it", LARGEST_SCAN)
         content = path.read_bytes()

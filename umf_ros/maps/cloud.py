@@ -28,6 +28,7 @@ from umf_ros.maps.mapping import Drive, add_drive
 from umf_ros.sensors.calibration import NO_CAMERA
 from umf_ros.sensors.decode import OdometrySample
 
+OnShare = Callable[[float], None]
 SPACING_M, CELL_M = 1.0, 2.0
 """Distance of places along a trajectory, and sides of the cells without one."""
 _START_NS, _SECOND_NS = 1_000_000_000 * 10**9, 10**9
@@ -92,19 +93,25 @@ def thinned(points: Array, path: Path) -> Array:
         UmfError: there are too few, or they lie too far apart.
     """
     if len(points) < _FEWEST:
-        raise UmfError(f"{path} holds {len(points)} points: too few for a map")
+        raise UmfError(f"{path} holds {len(points)} points that are no NaN and not at the origin: too few for a map")
     if (width_m := float(np.ptp(points, axis=0).max())) > _WIDEST_M:
         raise UmfError(f"{path} is {width_m:.3g} m wide: is it in metres, without outliers?")
     return points[first_of_cubes(points, _THIN_M)]
 
 
 def along(trajectory: Trajectory) -> Array:
-    """Return poses (K, 4, 4) of a trajectory, a metre apart; without rotations, they look along it."""
+    """Return poses (K, 4, 4) of a trajectory, a metre apart; without rotations, they look along it.
+
+    Raises:
+        UmfError: it is shorter than that.
+    """
     poses = trajectory.poses
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     rows = np.unique(np.floor(np.concatenate([[0.0], np.cumsum(steps)]) / SPACING_M), return_index=True)[1]
+    if len(rows) < 2:
+        raise UmfError(f"the trajectory has {len(poses)} poses within {SPACING_M:g} m: places are that far apart")
     chosen = poses[rows].copy()
-    if not trajectory.has_orientation and len(chosen) > 1:
+    if not trajectory.has_orientation:
         ways = np.gradient(chosen[:, :2, 3], axis=0)
         chosen[:, :3, :3] = Rotation.from_euler("z", np.arctan2(ways[:, 1:], ways[:, :1])).as_matrix()
     return chosen
@@ -160,21 +167,22 @@ class CloudViews:
 
 
 def import_cloud(
-    target: MapFolder, path: Path, views: CloudViews, embedder: Embedder, on_place: Callable[[], None] = lambda: None
+    target: MapFolder, path: Path, views: CloudViews, embedder: Embedder, on_view: OnShare = lambda _: None
 ) -> int:
-    """Add the views of the cloud of a file to a map; return their number.
+    """Add the views of the cloud of a file to a map; return their number; `on_view` takes the share that is done.
 
     Raises:
         UmfError: nothing is seen from the poses.
     """
-    first, count = dict[int, tuple[int, Array]](), 0
+    first, count, tried = dict[int, tuple[int, Array]](), 0, 0
     for turn_deg in views.headings_deg:
         rows = list(range(len(views.poses)))[:: -1 if turn_deg == 180 else 1]
         turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
         walked, stamps = _walk(views.poses[rows] @ make_pose(turn, np.zeros(3)))
         places, between = dict[int, Keyframe](), list[LoopClosure]()
         for row, place in _places(views, embedder, walked, dict(zip(stamps, rows, strict=True))):
-            on_place()
+            tried += 1
+            on_view(tried / (len(views.poses) * len(views.headings_deg)))
             if place is not None:
                 places[row] = place
         if not places:

@@ -71,6 +71,7 @@ class Opening:
         odometry: a TUM file, or a folder of files named like the recordings, `NAME.tum` or `NAME.odometry.tum`; None:
             that of the recording, or of its scans.
         odometry_frame: frame whose poses the files hold.
+        engine: that makes the odometry from the scans also where the recording has one; empty: only where it has none.
     """
 
     config: ParameterSource = None
@@ -79,11 +80,30 @@ class Opening:
     weights: str | None = None
     odometry: Path | None = None
     odometry_frame: str = "body"
+    engine: str = ""
 
     def settings(self, bag: Bag) -> Settings:
         """Return settings for a recording."""
         overrides = {"embedding__method": self.embedder, "embedding__weights": self.weights}
         return settings_for(bag, self.config, self.dataset, mode="mapping", **overrides)
+
+    def engine_for(self, bag: Bag, settings: Settings) -> str:
+        """Return the engine that makes odometry without a file; empty where that of the recording is used.
+
+        Raises:
+            BagError: there are neither odometry nor scans.
+        """
+        if not self.engine and present_topics(bag, settings).odometry:
+            return ""
+        if not self.engine and not can_track(bag, settings):
+            raise BagError(f"{bag.path} has neither odometry nor scans to make it from, {REMEDY}")
+        return self.engine or ODOMETRY_ENGINES[0]
+
+    def check(self, bag: Bag) -> None:
+        """Raise an `UmfError` if a recording cannot be opened with these options, or has no odometry."""
+        settings = self.settings(bag)
+        if self.odometry_of(bag.path, settings) is None:
+            self.engine_for(bag, settings)
 
     def odometry_of(self, recording: Path, settings: Settings) -> Trajectory | None:
         """Return the odometry of a recording from its TUM file; None where there is none."""
@@ -143,11 +163,9 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
 def _odometry(bag: Bag, opening: Opening, settings: Settings, folder: Path) -> Trajectory | None:
     """Return the odometry of a file, or of the scans where the recording has none, which is kept in the run folder."""
     given, made = opening.odometry_of(bag.path, settings), folder / MADE_ODOMETRY
-    if given is not None or present_topics(bag, settings).odometry:
+    if given is not None or not opening.engine_for(bag, settings):
         return given
-    if not can_track(bag, settings):
-        raise BagError(f"{bag.path} has neither odometry nor scans to make it from, {REMEDY}")
-    found = odometry_of_scans(bag, settings, ODOMETRY_ENGINES[0], made)
+    found = odometry_of_scans(bag, settings, opening.engine_for(bag, settings), made)
     write_tum(made, found)
     return found
 

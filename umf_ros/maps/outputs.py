@@ -174,7 +174,8 @@ def draw_map(path: Path, joint: JointMap, heights: HeightMap | None = None) -> N
             axes.add_collection(LineCollection(lines.tolist(), colors=colour, path_effects=halo))
             axes.plot(*lines.reshape(-1, 2).T, ".", color=colour, label=f"{len(lines)} closures {name} sessions")
     span_m = float(np.diff(axes.get_xlim())[0])
-    length_m = max(n * 10.0**power for n in (1, 2, 5) for power in range(-2, 6) if n * 10.0**power <= span_m / 4)
+    lengths_m = [n * 10.0**power for power in range(-2, 6) for n in (1, 2, 5)]
+    length_m = max((one for one in lengths_m if one <= span_m / 4), default=lengths_m[0])
     size = {"pad": 0.5, "sep": 4, "size_vertical": span_m / 250, "fill_bar": True}
     axes.add_artist(AnchoredSizeBar(axes.transData, length_m, f"{length_m:g} m", "lower right", **size))
     if axes.get_legend_handles_labels()[0]:

@@ -50,9 +50,7 @@ def _check(wanted: dict[str, Tensor], tensors: dict[str, Tensor], path: Path) ->
     differing = sorted(wanted.keys() ^ tensors.keys())
     differing += [name for name in wanted.keys() & tensors.keys() if wanted[name].shape != tensors[name].shape]
     if differing:
-        raise WeightsError(
-            f"{path} holds weights of another architecture: {differing[0]} and {len(differing) - 1} more"
-        )
+        raise WeightsError(f"{path} holds weights of another architecture: {differing[0]}, {len(differing) - 1} more")
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

@@ -75,9 +75,7 @@ def to_pose(pose: Array) -> Pose:
 def to_poses(poses: Array) -> list[Pose]:
     """Return (N, 4, 4) poses as messages."""
     both = zip(poses[:, :3, 3], to_quaternion(poses).tolist(), strict=True)
-    return [
-        Pose(position=to_point(position), orientation=Quaternion(x=x, y=y, z=z, w=w)) for position, (x, y, z, w) in both
-    ]
+    return [Pose(position=to_point(point), orientation=Quaternion(x=x, y=y, z=z, w=w)) for point, (x, y, z, w) in both]
 
 
 def to_header(stamp_ns: int, frame: str) -> Header:

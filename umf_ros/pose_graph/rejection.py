@@ -253,19 +253,16 @@ class OutlierRejection:
         if not len(at):
             return []
         # without outlier rejection, all closures within the limits
-        gate, most = (
-            (self.settings.gate_chi2, self.settings.max_chance) if self.settings.reject_outliers else (np.inf, 1)
-        )
+        known = self.settings
+        gate, most = (known.gate_chi2, known.max_chance) if known.reject_outliers else (np.inf, 1)
         agreed = []
-        for row, distance, misfit_m, joined, ratio, false_alarm, wide in zip(
-            at.tolist(), *self._compare(at), strict=True
-        ):
+        for row, distance, misfit_m, joined, ratio, chance, wide in zip(at.tolist(), *self._compare(at), strict=True):
             state, reason = State.PENDING, ClosureReason.UNSURE
             if wide > gate:
                 state, reason = State.REJECTED, ClosureReason.CONTRADICTS
             elif misfit_m > (self.settings.max_correction_m or np.inf):
                 state, reason = State.REJECTED, ClosureReason.TOO_FAR
-            elif distance <= gate and false_alarm <= most:
+            elif distance <= gate and chance <= most:
                 agreed.append(row)
             closure, sigmas = self.placed[row].closure, float(np.sqrt(distance))
             self.verdicts[row] = ClosureVerdict(closure, state, reason, sigmas, float(misfit_m))

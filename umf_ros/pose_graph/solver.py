@@ -79,9 +79,8 @@ class GraphSolver:
         for number, pose in zip(numbers, graph.poses, strict=True):
             values.insert(number, gtsam.Pose3(pose))
         for row in graph.anchors:
-            factors.add(
-                gtsam.PriorFactorPose3(numbers[row], gtsam.Pose3(graph.poses[row]), graph.loose.get(row, _ANCHOR))
-            )
+            pose, noise = gtsam.Pose3(graph.poses[row]), graph.loose.get(row, _ANCHOR)
+            factors.add(gtsam.PriorFactorPose3(numbers[row], pose, noise))
         for row, make in graph.absolute:
             factors.add(make(numbers[row]))
         self._factors = {key: self._factor(key, row, graph, numbers) for row, key in enumerate(graph.keys)}

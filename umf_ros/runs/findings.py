@@ -131,7 +131,7 @@ def _gaps(about: JudgedRun) -> Iterator[Advice]:
     seconds = (int(about.run.stamps[-1]) - int(about.run.stamps[0])) * 1e-9
     metres = np.nanmax(about.run.keyframes["path_length_m"], initial=0.0)
     rule = f"a match must be {rules.min_time_gap_s:g} s older and {rules.min_travel_m:g} m back"
-    what = f"the gap rules exclude every pair: {rule}, and the run lasts {seconds:.0f} s and {metres:.0f} m"
+    what = f"the gap rules exclude every pair: {rule}, and the keyframes cover {seconds:.1f} s and {metres:.0f} m"
     yield Advice("fault", what, gap_remedy(seconds, float(metres), about.run.settings))
 
 
@@ -392,7 +392,10 @@ class RunVerdict:
 
 
 def conclude(about: JudgedRun, findings: list[Advice]) -> RunVerdict:
-    """Return the verdict: green only with a closure found, or without any revisit."""
+    """Return the verdict: green only with a closure or a pose in the map, or without any revisit."""
+    if in_map := about.run.summary.get("localization"):
+        found = f"Pose in the map known at {in_map['located']} of {in_map['keyframes']} keyframes."
+        return RunVerdict(found, "good", 0) if in_map["located"] else RunVerdict(found, "bad", USELESS)
     sentence = ", ".join(filter(None, (_found(about), _used(about)))) + _errors(about) + "."
     closed, warnings = bool(about.run.closures), [finding for finding in findings if finding.severity != "note"]
     first = f"{_capital(warnings[0].what)}. " if warnings else ""
@@ -408,7 +411,8 @@ def _found(about: JudgedRun) -> str:
         reason = "there is no ground truth" if about.run.truth is None else "no ground truth for this time"
         return f"{len(about.run.closures)} loop closures; {reason} to judge them by"
     true = int(about.closures.is_true.sum())
-    return f"{true} true and {len(about.closures) - true} false loop closures at {about.revisits} revisits"
+    revisits = about.revisits or about.any_heading[0]
+    return f"{true} true and {len(about.closures) - true} false loop closures at {revisits} revisits"
 
 
 def _used(about: JudgedRun) -> str:

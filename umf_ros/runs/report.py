@@ -134,7 +134,7 @@ def _facts(summary: Summary) -> list[tuple[str, str]]:
         "keyframes": f"{summary['keyframes']}, {summary['queries']} of them with candidates",
         "closures": f"{summary['closures_published']} published, {summary['closures_rejected']} candidates rejected",
     }
-    if truth:
+    if truth and not summary.get("localization"):
         facts["revisits"] = _revisits(truth)
         facts["stated errors"] = _consistency(truth)
     if latency["total"]["p50"] is not None:
@@ -201,7 +201,7 @@ def finish_run(
 
 def _judged_by_itself(run: FinishedRun) -> str | None:
     """Return what the run says of its own closures, and write the table; None of a run without any."""
-    if not run.closures or not (run.folder / NAME).is_file():
+    if not run.closures or run.settings.localizing or not (run.folder / NAME).is_file():
         return None
     found = check_run(run.folder)
     found.write(run.folder / TABLE)

@@ -53,9 +53,8 @@ def pairs_of(about: JudgedRun) -> Pairs:
             best.setdefault(one.query_stamp_ns, one)
     for one in list(best.values())[: MOST["tested"]]:
         row = about.row(one.query_stamp_ns)
-        pairs[one.endpoints] = _describe(
-            about, one.endpoints, "tested", why=None if row is None else explain(about, row)
-        )
+        cause = None if row is None else explain(about, row)
+        pairs[one.endpoints] = _describe(about, one.endpoints, "tested", why=cause)
     return pairs
 
 

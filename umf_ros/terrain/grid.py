@@ -123,9 +123,8 @@ class TerrainTiles:
         shape = np.minimum(self.shape, np.maximum(side, max_cells // self.shape[::-1].clip(1)))
         first = np.floor(position[::-1] / self.cell_m).astype(np.int64) - shape // 2
         first = np.clip(first, self.first, self.first + self.shape - shape)
-        return TerrainGrid(
-            first[::-1] * self.cell_m, self.cell_m, _part(self.places, self.values, UNKNOWN, first, shape)
-        )
+        cells = _part(self.places, self.values, UNKNOWN, first, shape)
+        return TerrainGrid(first[::-1] * self.cell_m, self.cell_m, cells)
 
     def blocks(self) -> Iterator[tuple[Numbers, NDArray[np.float32]]]:
         """Yield the blocks of a picture, north up, that are not empty: its first row and column, and heights (H, W)."""

@@ -160,10 +160,8 @@ def count_inliers(query: Keyframe, match: Keyframe, settings: Verification) -> C
     ours, theirs = query.embedding, match.embedding
     reach = const.IMAGE_THRESHOLD * query.camera.width
     image = _explain(ours.image, theirs.image, fit_homography, reach, settings)
-    return {
-        settings.features: image,
-        "cloud": _explain(ours.cloud, theirs.cloud, fit_rigid, const.POINT_THRESHOLD_M, settings),
-    }
+    cloud = _explain(ours.cloud, theirs.cloud, fit_rigid, const.POINT_THRESHOLD_M, settings)
+    return {settings.features: image, "cloud": cloud}
 
 
 def _explain(

@@ -97,7 +97,7 @@ def test_images_are_named_as_views_or_beside_them(here: Path) -> None:
         ([], "MATCH is missing"),
         (["one.npy"], "QUERY is missing"),
         (["one.npy", "nowhere.npy"], "query: cannot read nowhere.npy"),
-        (["one.npy", "calibration.yaml"], "calibration.yaml is no scan: expected .pcd, .ply, .npy, .las, .laz or .bin"),
+        (["one.npy", "calibration.yaml"], "calibration.yaml is no cloud of points: expected .pcd, .ply, .npy, .las"),
         (["one.png", "other.png", "--match-left", "one.png"], "are both the left image"),
         (["one.npy", "other.npy", "--out", "v.csv"], "--out VERDICTS.csv goes with --list"),
         (["--list", "pairs.csv"], "--list PAIRS.csv needs --out"),

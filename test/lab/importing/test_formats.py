@@ -366,6 +366,8 @@ def test_an_imported_recording_is_of_no_known_data_set_and_never_overwritten(tmp
     again = only_line(umf("import", "folder", tmp_path / "set", tmp_path / "made.mcap"))
     assert "made.calibration.yaml is there already: nothing was written" in again
     assert (tmp_path / "made.calibration.yaml").read_text() == "measured"
+    (tmp_path / "set" / "times.txt").rename(tmp_path / "times.txt")
+    assert "scans and images need a times.txt of lines FILE SECONDS" in only_line(umf("inspect", tmp_path / "set"))
 
 
 @pytest.mark.parametrize("time", ["1625644800000000000", "-5", "1e30", "nan", "soon"])

@@ -272,9 +272,7 @@ def test_wrong_settings_and_missing_data(folder, tmp_path):
 
 
 def test_what_is_the_same_place_depends_on_the_data_set(folder):
-    kinds = [
-        rule_of(settings_for(folder, **chosen)) for chosen in ({}, {"rule": "robotcar"}, {"loss": "neighbourhood"})
-    ]
+    kinds = [rule_of(settings_for(folder, **one)) for one in ({}, {"rule": "robotcar"}, {"loss": "neighbourhood"})]
     thesis, robotcar, whole = kinds
     assert (thesis.positive_m, thesis.positive_deg, thesis.between_passes) == (12, 30, False)
     assert (robotcar.positive_m, robotcar.positive_deg, robotcar.negative_m) == (10, 180, 50)

@@ -9,7 +9,6 @@ import typer
 
 from umf_ros.commands.doctor import command as check_machine
 from umf_ros.commands.recordings import BagPath, Changes, ConfigPath, check_files, parameters, refuse_unused
-from umf_ros.core.errors import OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -137,10 +136,10 @@ def _conclude(console: Console, found: Inspected, ready: str) -> None:
 
 def _check_folder(folder: Path) -> tuple[Path, Path]:
     """Return the files to write in a folder; raise an `OutputError` if it is none, or one of them is there."""
+    from umf_ros.core.io import check_folder
     from umf_ros.lab.imported import check_absent
 
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"cannot write to {folder}: it is no folder")
+    check_folder(folder)
     files = folder / "my_rover.yaml", folder / "my_calibration.yaml"
     check_absent(*files)
     return files

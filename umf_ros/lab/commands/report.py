@@ -188,9 +188,10 @@ def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -
     from umf_ros.verification.hypothesis import RejectReason
 
     start = int(about.run.stamps[0])
+    match_start, where = (0, " of the map's clock") if about.run.settings.localizing else (start, "")
 
-    def at(stamp_ns: int) -> str:
-        return f"{(stamp_ns - start) * 1e-9:.1f} s"
+    def at(stamp_ns: int, start_ns: int = start) -> str:
+        return f"{(stamp_ns - start_ns) * 1e-9:.1f} s"
 
     def say(text: str) -> None:
         console.print(text, highlight=False, soft_wrap=True)
@@ -199,7 +200,7 @@ def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -
     say(f"[bold]{escape(why.gate)}[/]: {escape(why.what)}")
     if why.match_stamp_ns is not None:
         apart = f", {why.distance_m:.1f} m away by the truth" if why.distance_m < float("inf") else ""
-        say(f"the place is that of {at(why.match_stamp_ns)}, {why.match_stamp_ns} ns{apart}")
+        say(f"the place is that of {at(why.match_stamp_ns, match_start)}{where}, {why.match_stamp_ns} ns{apart}")
     if why.gate != "found":
         through = why.parameter or "no parameter: its measurements do not support a closure"
         say(f"would accept it: {escape(through)}")
@@ -210,9 +211,8 @@ def _tell(console: Console, about: JudgedRun, row: int, why: ClosureDiagnosis) -
             apart_m = about.distance(*one.endpoints)
             probability = "" if one.probability is None else f"{one.probability:.3f}"
             known = f"{apart_m:.1f}" if apart_m < float("inf") else ""
-            table.add_row(
-                at(one.match_stamp_ns), f"{one.candidate.similarity:.3f}", probability, known, escape(one.outcome)
-            )
+            likeness, then = f"{one.candidate.similarity:.3f}", at(one.match_stamp_ns, match_start)
+            table.add_row(then, likeness, probability, known, escape(one.outcome))
         print_table(console, table)
         if others := len(tested) - len(compared):
             say(f"{others} more: {RejectReason.NOT_COMPARED.value}")

@@ -78,9 +78,8 @@ class CameraLook:
 
     def _disturb(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """The light (h, w) under lamps, with a moved shadow, against the sun, through specks of dust."""
-        y, x = (
-            axis.astype(np.float32) for axis in np.ogrid[-1 : 1 : light.shape[0] * 1j, -1 : 1 : light.shape[1] * 1j]
-        )
+        grid = np.ogrid[-1 : 1 : light.shape[0] * 1j, -1 : 1 : light.shape[1] * 1j]
+        y, x = (axis.astype(np.float32) for axis in grid)
         if self.lamps > 0:
             cone = 1.6 * np.exp(-(x**2) / 0.5 - (y - 0.4) ** 2 / 0.4)
             light = light * (1 - self.lamps + self.lamps * cone)

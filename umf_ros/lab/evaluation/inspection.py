@@ -25,7 +25,7 @@ from umf_ros.runs.findings import gap_remedy
 from umf_ros.sensors.calibration import TO_BE_MEASURED, load_calibration
 from umf_ros.sensors.decode import OdometrySample, decode_camera_info, decode_cloud, decode_image, decode_pose, stamp_ns
 from umf_ros.sensors.sensor_check import SensorCheck, SensorReport
-from umf_ros.sensors.tf import TOPIC, StaticTransforms
+from umf_ros.sensors.tf import StaticTransforms
 from umf_ros.sensors.topic_finder import find_topics
 
 SAMPLES = 20
@@ -181,8 +181,6 @@ def _about_inputs(bag: Bag, found: Inspected) -> Iterator[Advice]:
     topics = found.topics
     if not topics.left_image and not topics.cloud and not found.ambiguous:
         yield Advice("fault", "neither images nor scans", "nothing to recognise a place by")
-    elif not topics.left_image and "left_image" not in found.ambiguous:
-        yield Advice("note", "no images: everything rests on the scans")
     yield from absent_inputs(bag, found.settings, odometry_from_file=True)
     if topics.left_image and not topics.left_info and found.unknown:
         yield Advice("note", "no camera_info: the calibration must say the intrinsics")
@@ -306,7 +304,7 @@ def write_calibration(found: Inspected, transforms: StaticTransforms) -> str:
     for key, name, usual in (("body_T_camera", "left_image", OPTICAL), ("body_T_lidar", "cloud", np.eye(4))):
         if name in frames:
             known = transforms.find(bodies[0], frames[name]) if bodies and frames[name] else None
-            source = f"{key}: of {frames[name]} in {bodies[0]}, from {TOPIC}" if known is not None else ""
+            source = f"{key}: of {frames[name]} in {bodies[0]}, by static transforms" if known is not None else ""
             notes.append(source or f"{TO_BE_MEASURED}: {key}")
             entries[key] = pose_entry(usual if known is None else known)
     offsets = {"lidar_time_offset_s": 0.0, "min_intensity": 0.0, "max_height_m": 0.0}

@@ -200,9 +200,8 @@ class WorldEvaluation:
             self._report()
         task, similarity = self._ask((REVISIT,))
         ranking = rank(similarity)
-        queries, references = (
-            [self._places.keyframes[row] for row in rows] for rows in (task.queries, task.references)
-        )
+        sides = task.queries, task.references
+        queries, references = ([self._places.keyframes[row] for row in rows] for rows in sides)
         reranking = rerank_all(queries, references, ranking, similarity, self._settings, self._report)
         return WorldResult(
             name=self._world.name,
