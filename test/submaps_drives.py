@@ -28,9 +28,8 @@ def rough_ground(seed: int) -> Array:
     """(N, 3) points of hills, ripples and boulders, m, world frame."""
     rng = np.random.default_rng(seed)
     xy = np.column_stack([rng.uniform(-35, 80, 260_000), rng.uniform(-32, 32, 260_000)])
-    z = sum(
-        a * np.sin(xy @ rng.normal(0, k, 2) + rng.uniform(0, 6)) for a, k in [(0.4, 0.2), (0.1, 0.6), (0.05, 1.5)] * 3
-    )
+    waves = [(0.4, 0.2), (0.1, 0.6), (0.05, 1.5)] * 3
+    z = sum(a * np.sin(xy @ rng.normal(0, k, 2) + rng.uniform(0, 6)) for a, k in waves)
     for centre, size in zip(rng.uniform([-30, -30], [75, 30], (220, 2)), rng.uniform(0.3, 1.2, 220), strict=True):
         z += 0.7 * size * np.exp(-((np.linalg.norm(xy - centre, axis=1) / size) ** 2))
     return np.c_[xy, z - 1.2]

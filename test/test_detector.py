@@ -66,9 +66,8 @@ def ground() -> np.ndarray:
     """(N, 3) points of a rough hilly ground with boulders, m, world frame."""
     rng = np.random.default_rng(3)
     xy = rng.uniform(-45, 45, (160_000, 2))
-    z = sum(
-        a * np.sin(xy @ rng.normal(0, k, 2) + rng.uniform(0, 6)) for a, k in [(0.5, 0.3), (0.3, 0.6), (0.12, 1.2)] * 4
-    )
+    waves = [(0.5, 0.3), (0.3, 0.6), (0.12, 1.2)] * 4
+    z = sum(a * np.sin(xy @ rng.normal(0, k, 2) + rng.uniform(0, 6)) for a, k in waves)
     for centre, size in zip(rng.uniform(-40, 40, (150, 2)), rng.uniform(0.3, 1.5, 150), strict=True):
         z += size * np.exp(-((np.linalg.norm(xy - centre, axis=1) / size) ** 2))
     return np.c_[xy, z - 1.5]

@@ -51,9 +51,8 @@ def test_a_workspace_of_links_has_the_same_executables(install: Path, tmp_path: 
     """`colcon build --symlink-install` builds beside links to the sources, without pyproject.toml."""
     linked = built(tmp_path, "--symlink-install")
     for folder in ("bin", "lib/umf_ros", "share/umf_ros/launch", "share/umf_ros/models"):
-        assert {path.name for path in (linked / folder).iterdir()} == {
-            path.name for path in (install / folder).iterdir()
-        }
+        there, here = ({path.name for path in (one / folder).iterdir()} for one in (linked, install))
+        assert there == here
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     places = os.environ | {"PATH": path, "COLCON_CURRENT_PREFIX": str(linked)}
     done = run("bash", "-c", f". {linked}/share/umf_ros/package.sh && umf --version", env=places)

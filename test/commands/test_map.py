@@ -70,9 +70,8 @@ def test_sessions_of_a_wrong_mounting_are_apart(mini_bag: Path, again: Path, min
     changes = "--set", f"calibration={tmp_path / 'wrong.yaml'}", "--out", tmp_path / "map"
     told = umf("map", mini_bag, again, "--config", mini_config, *changes).text
     assert "correct body_T_lidar of the calibration or /tf_static: quaternion: [" in told
-    assert "mini: the LiDAR's mounting is off by 8" in (tmp_path / "map" / "report.html").read_text().replace(
-        "&#39;", "'"
-    )
+    page = (tmp_path / "map" / "report.html").read_text().replace("&#39;", "'")
+    assert "mini: the LiDAR's mounting is off by 8" in page
     assert "closures are withheld" in told and "1 of 2 sessions in one frame; closures between them: 0 found" in told
 
 
@@ -138,6 +137,9 @@ def test_a_rover_finds_itself_in_the_map_which_stays_as_it_is(
     assert f"Pose in the map known at {about['located']} of" in umf("report", tmp_path / "latest").out
     told = only_line(umf("replay", again, "--map", out, "--out", tmp_path / "none", "--resume"))
     assert told == "a localising run has no use for --resume" and not (tmp_path / "none").exists()
+    blind = write_mcap(tmp_path / "blind.mcap", [one for one in traverse(0.3) if one[0] not in (CLOUD, ODOMETRY)])
+    told = only_line(umf("replay", blind, "--config", mini_config, "--map", out, "--out", tmp_path / "none"))
+    assert "without odometry cannot be localised" in told and not (tmp_path / "none").exists()
 
 
 def test_the_map_is_a_point_cloud_too(made: tuple[Path, Ended]) -> None:

@@ -89,9 +89,8 @@ def bare_wall(seed: int, pitch_deg: float) -> np.ndarray:
     """(N, 3) a wall 9 m ahead with ivy before it, seen by a LiDAR that looks up, noisy and with flying pixels."""
     rng, scene = np.random.default_rng(seed), np.random.default_rng(0)
     across = scene.uniform(-0.6, 0.6, 9000), scene.uniform(-0.26, 0.26, 9000)
-    wall = np.column_stack(
-        [np.full(9000, 9.0), 9.0 * np.tan(across[0]), 9.0 * np.tan(across[1] + np.radians(pitch_deg))]
-    )
+    y, z = 9.0 * np.tan(across[0]), 9.0 * np.tan(across[1] + np.radians(pitch_deg))
+    wall = np.column_stack([np.full(9000, 9.0), y, z])
     ivy = scene.normal([7.5, 2.0, 4.0], 0.8, (200, 3))
     points = np.concatenate([wall, ivy])
     ranges = 1 + rng.normal(0, 0.05, (len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True)

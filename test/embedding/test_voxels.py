@@ -32,9 +32,7 @@ def test_a_point_lands_in_its_voxel():
     assert np.count_nonzero(scan.grid) == np.count_nonzero(features_of(scan, 10, 16, 23))
 
 
-@pytest.mark.parametrize(
-    "outside", [(-0.1, 0, 0), (40.0, 0, 0), (5, 20.0, 0), (5, -20.1, 0), (5, 0, 6.0), (5, 0, -6.1)]
-)
+@pytest.mark.parametrize("outside", [(-0.1, 0, 0), (40, 0, 0), (5, 20.0, 0), (5, -20.1, 0), (5, 0, 6), (5, 0, -6.1)])
 def test_the_box_is_metric(outside):
     """The reference's grid of one metre keeps one voxel of a real scan."""
     assert not voxelise(cluster(*outside), None, 8, 8).fine_mask.any()

@@ -105,9 +105,8 @@ def test_transforms_decide_the_rig(tf2_msgs: None, rig: Vlp16Rover, tmp_path: Pa
         categories.extend(one.value for one in message.status[0].values if one.key == "failure_category")
 
     rig.create_subscription(DiagnosticArray, "/diagnostics", hear, 10)
-    front = Process(
-        FRONT_END, tmp_path / "front.log", "embedding.method:=thumbnail", f"results_dir:={tmp_path / 'run'}"
-    )
+    log, out = tmp_path / "front.log", tmp_path / "run"
+    front = Process(FRONT_END, log, "embedding.method:=thumbnail", f"results_dir:={out}")
     try:
         rig.until_heard(front)
         rig.drive(1.0)

@@ -75,7 +75,8 @@ def test_a_lone_wrong_closure_is_named_by_the_overlap_beside_it() -> None:
 
 def test_a_run_without_closures_has_nothing_to_judge() -> None:
     found = judged(two_laps())
-    assert found.sentence == "no closures to judge" and not found.doubted and np.isnan(found.precision).all()
+    assert found.sentence == "not judged: no closures with odometry"
+    assert not found.doubted and np.isnan(found.precision).all()
 
 
 @pytest.mark.parametrize("live", [False, True])
@@ -95,7 +96,7 @@ def test_the_command_prints_precision_and_doubts_and_writes_a_table(tmp_path: Pa
                 file.append_picture(Picture(stamp, b"", 0, 0, quantize(points[:3000], SCAN_UNIT_M)))
     done = umf("judge", tmp_path)
     assert done.status == 0, done.err
-    assert "1 of 16 closures doubted; judged from the run itself, without truth" in done.out
+    assert "1 of 16 closures doubted; judged from the run itself" in done.out
     assert f"doubted: closure {30 * 10**9} {(30 + LAP) * 10**9}, 100.0 s back" in done.out
     table = read_table(tmp_path / TABLE, lambda row: float(row["probability"]))
     assert len(table) == 16 and table[-1] < 0.5 < min(table[:-1])

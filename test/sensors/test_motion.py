@@ -48,9 +48,8 @@ def test_paths_go_on_across_a_jump(jump: Array) -> None:
         buffer.add(ns(second), jump @ drive(second) if second > 2 else drive(second))
     for second in (1.9, 2.1, 3.9):
         found = buffer.at(ns(second))
-        assert found is not None and np.allclose(
-            found, jump @ drive(second) if second > 2 else drive(second), atol=2e-3
-        )
+        expected = jump @ drive(second) if second > 2 else drive(second)
+        assert found is not None and np.allclose(found, expected, atol=2e-3)
     path = buffer.path(ns(1.9), ns(2.1)).poses
     np.testing.assert_allclose(relative(path[0], path[-1]), relative(drive(1.9), drive(2.1)), atol=5e-3)
     smooth = filled(seconds).samples(ns(1), ns(3))

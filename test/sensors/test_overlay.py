@@ -43,9 +43,8 @@ def looked(rng: np.random.Generator, turn_deg: np.ndarray, baseline: float, late
     motion = ScanMotion(np.zeros(len(points), np.float32), rates, np.zeros(6))
     frame = Frame(0, CAMERA, BODY_T_CAMERA, BODY_T_LIDAR, points=points.astype(np.float32), motion=motion)
     pixels, depth = CAMERA.project(points, BODY_T_CAMERA)
-    chosen = np.flatnonzero((pixels > 0).all(axis=1) & (pixels < (688, 512)).all(axis=1) & (depth > 2) & (depth < 15))[
-        ::6
-    ]
+    inside = (pixels > 0).all(axis=1) & (pixels < (688, 512)).all(axis=1)
+    chosen = np.flatnonzero(inside & (depth > 2) & (depth < 15))[::6]
     looks = np.column_stack([(pixels[chosen] - (CAMERA.cx, CAMERA.cy)) / CAMERA.fx, np.ones(len(chosen))])
     true = distances(here @ BODY_T_CAMERA, looks)
     disparity = CAMERA.fx * CAMERA.baseline / baseline / true + rng.normal(0, noise, len(true))

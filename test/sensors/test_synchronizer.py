@@ -413,9 +413,8 @@ def test_whole_scans_are_never_joined(calibration: Calibration, period_ms: int) 
     synchronizer, counts = Synchronizer(Sync(), calibration, {"cloud"}), []
     full = whole_scan()
     for at in range(20):
-        turned = transform(
-            make_pose(Rotation.from_euler("z", 10 * at, degrees=True).as_matrix(), [0, 0, 0]), full.points
-        )
+        turn = Rotation.from_euler("z", 10 * at, degrees=True).as_matrix()
+        turned = transform(make_pose(turn, [0, 0, 0]), full.points)
         narrow = np.abs(turned[:, 1]) < turned[:, 0]
         synchronizer.add("cloud", T0 + at * period_ms * MS, Cloud(turned[narrow].astype(np.float32)))
         counts.append(len(synchronizer.pop()))

@@ -22,9 +22,8 @@ TRUE = make_pose(Rotation.from_euler("zyx", [25, 2, -3], degrees=True).as_matrix
 
 def keyframe(motion: ScanMotion | None) -> Keyframe:
     camera = StereoCamera(1, 1, 1.0, 1.0, 0.0, 0.0, 0.0)
-    return Keyframe(
-        1, Embedding(np.ones(1, np.float32)), camera, np.eye(4), np.empty((0, 3), np.float32), motion=motion
-    )
+    embedding, points = Embedding(np.ones(1, np.float32)), np.empty((0, 3), np.float32)
+    return Keyframe(1, embedding, camera, np.eye(4), points, motion=motion)
 
 
 def aligned(rng: np.random.Generator) -> tuple[Alignment, Array]:

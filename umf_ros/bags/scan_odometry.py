@@ -16,7 +16,7 @@ from umf_ros.core.config import EmbeddingSettings, Settings, topics_of
 from umf_ros.core.errors import BagError
 from umf_ros.core.frames import Frame
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.sensors.scan_odometry import ENGINES, FEWEST_POINTS, MAX_LOST, ScanOdometry
+from umf_ros.sensors.scan_odometry import ENGINES, FEWEST_POINTS, MAX_LOST, RANGE_M, ScanOdometry
 
 OnScan = Callable[[float], None]
 FIRST = 5
@@ -54,7 +54,8 @@ def odometry_of_scans(
         raise BagError(f"{bag.path} has no scans for --odometry {engine}")
     names = {name: "" for name in topics.model_dump() if name != "cloud"}
     alone = {"topics": topics.model_copy(update=names), "embedding": EmbeddingSettings()}
-    reader = FrameReader(bag, settings.model_copy(update=alone), warn=lambda _: None)
+    told: list[str] = []
+    reader = FrameReader(bag, settings.model_copy(update=alone), warn=told.append)
     scans = _first_session(reader)
     first = list(islice(scans, FIRST))
     trial = ScanOdometry(ENGINES[engine]())
@@ -65,7 +66,8 @@ def odometry_of_scans(
         odometry.add(frame)
         on_scan(reader.progress)
     if len(odometry.samples) < FIRST:
-        raise BagError(f"{bag.path} has no scans that follow each other: --odometry {engine} needs them")
+        why = told[0] if told else f"--odometry {engine} needs them"
+        raise BagError(f"{bag.path} has no scans that follow each other: {why}")
     _check(engine, odometry, settings.sync.max_odometry_gap_s)
     return odometry.trajectory()
 
@@ -77,7 +79,7 @@ def _first_session(frames: Iterable[Frame]) -> Iterator[Frame]:
         session = frame.session if session is None else session
         if frame.session != session:
             return
-        if frame.points is not None and len(frame.points) >= FEWEST_POINTS:
+        if frame.points is not None and (np.abs(frame.points) < RANGE_M).all(axis=1).sum() >= FEWEST_POINTS:
             yield frame
 
 

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from umf_ros.commands import recordings as options
-from umf_ros.core.errors import ConfigError, command_line
+from umf_ros.core.errors import ConfigError, UmfError, command_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -25,13 +25,11 @@ if TYPE_CHECKING:
 
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.")]
 Workers = Annotated[int, typer.Option(min=1, max=256, help="Number of processes that replay and match recordings.")]
-RayAddress = Annotated[
-    str | None, typer.Option("--ray", help="Distribute by Ray: address of a cluster that has these files, or local.")
-]
+RayAddress = Annotated[str | None, typer.Option("--ray", help="Ray cluster that has these files: address or local.")]
 MapPath = Annotated[Path, typer.Option("--out", help="Folder of the map, new or one to add to.")]
-OdometryFolder = Annotated[
+OdometryFiles = Annotated[
     str | None,
-    typer.Option("--odometry", metavar="FOLDER|ENGINE", help="TUM files named like recordings; vgicp: of the scans."),
+    typer.Option("--odometry", metavar="FILE|ENGINE", help="TUM file, or folder of NAME.tum; vgicp: of the scans."),
 ]
 
 Pair = Annotated[tuple[int, int] | None, typer.Option(metavar="MATCH QUERY", help="Closure by its keyframes' stamps.")]
@@ -68,7 +66,7 @@ def command(
     weights: options.WeightsPath = None,
     workers: Workers = 1,
     ray: RayAddress = None,
-    odometry: OdometryFolder = None,
+    odometry: OdometryFiles = None,
     odometry_frame: options.OdometryFrame = "",
 ) -> None:
     """Make one map of many recordings, or add recordings to one.
@@ -218,7 +216,7 @@ def import_cloud(
     from rich.console import Console
 
     from umf_ros.bags.trajectories import read_tum
-    from umf_ros.commands.console import PLAIN, LineProgress, telling_interrupts, waiting
+    from umf_ros.commands.console import PLAIN, WARNING, LineProgress, telling_interrupts, waiting
     from umf_ros.core.config import load_settings
     from umf_ros.core.io import check_writable
     from umf_ros.detector import make_detector_embedder
@@ -246,9 +244,15 @@ def import_cloud(
     ):
         target = MapFolder.open_or_create(Path(made) / "map", settings)
         count = clouds.import_cloud(target, cloud, views, embedder, progress.advance_to)
+        if (missing := len(poses) * len(headings) - count) > count:
+            raise UmfError(f"{missing} of {missing + count} views {clouds.BLIND}")
         copytree(target.path, out, dirs_exist_ok=True)
     summary = _solve(MapFolder.open(out), console)
     console.print(f"{out}: {count} places", **PLAIN)
+    if missing:
+        console.print(f"{missing} of {missing + count} views {clouds.BLIND}", **WARNING)
+    if outside := sum(one["places"] for one in summary["sessions"] if not one["joined"]):
+        console.print(f"{outside} places are not connected with the others: nothing is found there", **WARNING)
     _print_files(out, summary, console)
     console.print(f"next: {command_line('replay', 'BAG', '--map', out)}", **PLAIN)
 
@@ -265,6 +269,7 @@ def _solve(target: MapFolder, console: Console) -> dict[str, Any]:
 
 def _new_recordings(target: MapFolder, bags: list[Bag], console: Console) -> dict[str, Path]:
     """The recordings that are not in the map yet, by the names of their sessions to be."""
+    from umf_ros.commands.console import PLAIN
     from umf_ros.runs.reader import describe_recording
 
     new: dict[str, Path] = {}
@@ -274,7 +279,7 @@ def _new_recordings(target: MapFolder, bags: list[Bag], console: Console) -> dic
         known = target.find(about)
         if known is not None or about in described:
             as_name = f", as {known.name}" if known else ""
-            console.print(f"{recording}: in the map already{as_name}", markup=False, soft_wrap=True)
+            console.print(f"{recording}: in the map already{as_name}, by the settings of then", **PLAIN)
             continue
         described.append(about)
         new[target.free_name(recording, new)] = recording

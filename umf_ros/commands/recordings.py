@@ -61,6 +61,8 @@ def check_files(bag: Path, *others: Path | None) -> None:
 
 def check_run(folder: Path) -> None:
     """Check that a folder holds a run, which may have been killed; else the error names what may be meant."""
+    if not folder.exists():
+        raise UmfError(f"there is no run {folder}")
     runs = folder / "latest", *sorted(folder.glob("sessions/*"))
     if meant := [str(run) for run in runs if (run / "run.sqlite").is_file()]:
         raise UmfError(f"{folder} holds runs and is none; did you mean {either(meant)}?")
@@ -150,8 +152,9 @@ class ChosenOdometry:
         reason why the default engine fails.
 
         Raises:
-            BagError: the file cannot be read, or an engine fails that the user named.
+            BagError: the file cannot be read, or an engine fails that the user named or that is needed to localise.
         """
+        from umf_ros.bags.inputs import present_topics
         from umf_ros.bags.scan_odometry import can_track, odometry_of_scans
         from umf_ros.bags.trajectories import read_odometry
         from umf_ros.commands.console import PLAIN, LineProgress
@@ -160,13 +163,15 @@ class ChosenOdometry:
         if self.path is not None:
             return read_odometry(self.path, self.frame, settings)
         if not self.engine or not (self.is_wanted or can_track(recording, settings)):
+            if settings.localizing and not present_topics(recording, settings).odometry:
+                raise ConfigError("a rover without odometry cannot be localised: give --odometry FILE.tum")
             return None
         console.print(f"odometry: {self.engine} on the scans of {topics_of(settings).cloud}", **PLAIN)
         try:
             with LineProgress(console, "Odometry of the scans") as progress:
                 return odometry_of_scans(recording, settings, self.engine, made, progress.advance_to)
         except BagError as error:
-            if self.is_wanted:
+            if self.is_wanted or settings.localizing:
                 raise
             warn(f"no odometry: {error}")
             return None

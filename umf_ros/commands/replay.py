@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -87,7 +88,7 @@ def command(
         from umf_ros.runs.reader import read_run, remember_recording
         from umf_ros.runs.rerun_log import RerunLog
         from umf_ros.runs.run_file import read_odometry_of
-        from umf_ros.runs.writer import begin_folder, count_drops, finish_folder, unfinished_folder, with_places
+        from umf_ros.runs.writer import begin_folder, count_drops, finish_folder, with_places
 
     _tell_inputs(console, settings)
     warnings: list[str] = []
@@ -95,7 +96,7 @@ def command(
     if settings.localizing:
         options.refuse_unused("a localising run", {"--rerun": rerun, "--viewer": live, "--resume": resume})
     truth = read_ground_truth(None, ground_truth)
-    unfinished = unfinished_folder(out, bag, settings) if resume else None
+    unfinished = _unfinished(out, bag, settings, warn) if resume else None
     path = chosen.read(console, recording, settings, unfinished and unfinished / MADE_ODOMETRY, warn)
     with waiting(console, "Loading the network"):
         reader = FrameReader(recording, settings, path, warn=warn)
@@ -143,6 +144,15 @@ def command(
             status = finish_run(run, recording, console, sensors, frozenset(warnings + absent)).exit_code
     replay.raise_if_frames_failed()
     raise typer.Exit(128 + interrupted() if interrupted() else status)
+
+
+def _unfinished(out: Path, bag: Path, settings: Settings, warn: Callable[[str], None]) -> Path | None:
+    """Return the folder of the replay that --resume continues; warn where there is none."""
+    from umf_ros.runs.writer import unfinished_folder
+
+    if (found := unfinished_folder(out, bag, settings)) is None:
+        warn(f"nothing to resume: {out} holds no interrupted replay of {bag}")
+    return found
 
 
 def _tell_inputs(console: Console, settings: Settings) -> None:

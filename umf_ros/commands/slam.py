@@ -16,7 +16,7 @@ def command(
     dataset: options.DatasetName = "auto",
     embedder: options.EmbedderName = None,
     weights: options.WeightsPath = None,
-    odometry: options.OdometryChoice = None,
+    odometry: maps.OdometryFiles = None,
     odometry_frame: options.OdometryFrame = "",
 ) -> None:
     """Make a map of one recording: odometry, loop closures, pose graph and ground in one command.

@@ -136,9 +136,7 @@ class Verification(Group):
 
     min_probability: float = Field(0.9, ge=0, le=1, description="least probability of a published closure")
     seed: int = Field(0, ge=0, description="seed of every RANSAC")
-    features: Literal["umf", "xfeat"] = Field(
-        "xfeat", description="local features of images: XFeat's, or those of the embedding network"
-    )
+    features: Literal["umf", "xfeat"] = Field("xfeat", description="local features of images: XFeat's or the network's")
     modalities: Literal["both", "image", "cloud"] = Field("both", description="local features that reranking uses")
     rerank_features: int = Field(200, ge=20, le=2000, description="strongest features per modality for reranking")
     ransac_iterations: int = Field(100, ge=10, le=5000, description="iterations of every RANSAC")
@@ -166,32 +164,24 @@ class PoseGraphSettings(Group):
     pair_chi2: float = Field(33.6, gt=0, description="largest squared Mahalanobis distance between consistent closures")
     alias_radius_m: float = Field(15.0, gt=0, description="radius of wrong closures to similar places, m")
     max_chance: float = Field(0.02, gt=0, le=1, description="largest false-alarm probability of acceptance at once")
-    min_support: float = Field(
-        8.0, ge=0, description="evidence that closures of several places need, nats; each further place gives up to 4"
-    )
+    min_support: float = Field(8.0, ge=0, description="nats that closures of several places need, each up to 4")
     place_m: float = Field(10.0, ge=0, description="path length within which closures count as one place, m")
     support_range_m: float = Field(80.0, gt=0, description="path length within which closures are compared, m")
     patience_m: float = Field(60.0, ge=0, description="path after which an uncontradicted closure is accepted, m")
     max_pending_s: float = Field(30.0, gt=0, description="longest wait of a closure for its odometry, stream time, s")
     origin: str = Field(
-        "", description="latitude, longitude (deg) and height (m) of the world frame; empty: the first good GNSS fixes"
+        "", description="latitude, longitude (deg), height (m) of the world frame; empty: by GNSS fixes"
     )
     elevation_model: str = Field("", description="heights of the ground: a GeoTIFF or an .asc; empty: none")
     elevation_sigma_m: float = Field(0.5, gt=0, description="standard deviation of its heights, m")
-    elevation_start: str = Field(
-        "", description="x and y (m) and heading (deg) of the first pose in the elevation model; empty: by GNSS"
-    )
-    reject_outliers: bool = Field(
-        True, description="reject outliers and estimate the noise scale; false: accept every closure as stated"
-    )
+    elevation_start: str = Field("", description="x, y (m), heading (deg) of the first pose in the model; empty: GNSS")
+    reject_outliers: bool = Field(True, description="reject outliers and scale the noise; false: accept all closures")
 
 
 class LocalizationSettings(Group):
     """Use of a drive that localised in a map."""
 
-    update: bool = Field(
-        False, description="it becomes a session of the map at ~/save and at the end; needs a folder of results"
-    )
+    update: bool = Field(False, description="it joins the map at ~/save and at the end; needs a folder of results")
     initial_pose: str = Field(
         "",
         description="x and y (m) and heading (deg) in the map where the rover may start, verified like a closure; "
@@ -256,14 +246,10 @@ class WorkerSettings(Group):
 class Settings(Group):
     """All settings."""
 
-    dataset: Dataset = Field(
-        DEFAULT_DATASET, description="preset of calibration and topics, a file in `config/datasets` by its name"
-    )
-    calibration: str = Field(
-        "", description="calibration file (YAML); tf: /tf_static and camera_info alone; empty: the data set's"
-    )
+    dataset: Dataset = Field(DEFAULT_DATASET, description="calibration and topics: a file in `config/datasets` by name")
+    calibration: str = Field("", description="YAML file; tf: /tf_static and camera_info alone; empty: the data set's")
     mode: Literal["mapping", "localization"] = Field(
-        "mapping", description="mapping: add places; localization: localise in the map that `map` names"
+        "mapping", description="mapping, or localization in the map that `map` names"
     )
     map: str = Field("", description="folder of a map that `umf map` made, for mode localization")
     localization: LocalizationSettings = LocalizationSettings()

@@ -246,6 +246,8 @@ def folder(source: Path) -> Imported:
             stamp = _stamp_ns(seconds)
         except ValueError:
             raise SensorFileError(f"{source / 'times.txt'}: expected lines FILE SECONDS, found {line[:60]!r}") from None
+        if not path.is_file():
+            raise SensorFileError(f"{source / 'times.txt'}: there is no file {name.strip()}")
         if path.suffix.lower() in SUFFIXES:
             found.scans.append((stamp, partial(read_scan, path)))
         elif path.suffix.lower() in IMAGE_SUFFIXES:

@@ -28,7 +28,6 @@ from umf_ros.maps.mapping import Drive, add_drive
 from umf_ros.sensors.calibration import NO_CAMERA
 from umf_ros.sensors.decode import OdometrySample
 
-OnShare = Callable[[float], None]
 SPACING_M, CELL_M = 1.0, 2.0
 """Distance of places along a trajectory, and sides of the cells without one."""
 _START_NS, _SECOND_NS = 1_000_000_000 * 10**9, 10**9
@@ -37,6 +36,7 @@ _EXACT = np.diag([0.01, 0.01, 0.01, 0.002, 0.002, 0.002]) ** 2
 # and in m; points are so sparse near the LiDAR that wider cells close the gaps between them
 _FINE, _COARSE, _COARSE_M = (1.0, 1.05, 0.3), (3.0, 1.4, 0.5), 6.0
 _NEAREST_M, _FEWEST, _THIN_M, _WIDEST_M = 0.5, 100, 0.1, 50_000.0
+BLIND = f"have fewer than {_FEWEST} points: is the trajectory in the frame of the cloud, in metres, z upwards?"
 # a rover stands where so many points are, few of them in its way above the ground, and no step is next to it
 _GROUND_POINTS, _GROUND_SHARE, _BODY_M, _IN_THE_WAY, _STEP_M = 20, 0.1, (0.4, 1.8), 0.05, 0.6
 
@@ -167,7 +167,7 @@ class CloudViews:
 
 
 def import_cloud(
-    target: MapFolder, path: Path, views: CloudViews, embedder: Embedder, on_view: OnShare = lambda _: None
+    target: MapFolder, path: Path, views: CloudViews, embedder: Embedder, on_view: Callable[[float], None]
 ) -> int:
     """Add the views of the cloud of a file to a map; return their number; `on_view` takes the share that is done.
 
@@ -186,7 +186,7 @@ def import_cloud(
             if place is not None:
                 places[row] = place
         if not places:
-            raise UmfError(f"{path}: no view has {_FEWEST} points: is the trajectory in its frame, in metres?")
+            raise UmfError(f"{path}: all views {BLIND}")
         for row in places.keys() & first.keys():
             (match_ns, match_pose), place = first[row], places[row]
             assert place.odom_T_body is not None

@@ -170,9 +170,8 @@ def _graph(about: JudgedRun) -> Iterator[Advice]:
         own = [one for one in verdicts if one.state == state]
         if len(own) > MUCH_REJECTED * total:
             reason = Counter(one.reason for one in own).most_common(1)[0][0]
-            sigma = (
-                f", {np.nanmedian([one.residual for one in own]):.1f} sigma in the median" if remedy == worse else ""
-            )
+            residuals = [one.residual for one in own]
+            sigma = f", {np.nanmedian(residuals):.1f} sigma in the median" if remedy == worse else ""
             yield Advice("warning", f"the graph {state} {len(own)} of {total} closures ({reason}{sigma})", remedy)
 
 

@@ -112,7 +112,8 @@ def closure_rows(about: JudgedRun) -> list[list[str]]:
         at_s, back_s = ((closure.query_stamp_ns - other) * 1e-9 for other in (start, closure.match_stamp_ns))
         shift_m, turn_deg = size_of(closure.match_T_query)
         verdict, judged = about.run.verdicts.get(closure.endpoints), about.by_endpoints.get(closure.endpoints)
-        figures = [f"{at_s:.1f}", f"{back_s:.1f}", f"{shift_m:.2f}", f"{turn_deg:.1f}", f"{closure.probability:.4f}"]
+        back = "-" if about.run.settings.localizing else f"{back_s:.1f}"  # the clock of the map is another
+        figures = [f"{at_s:.1f}", back, f"{shift_m:.2f}", f"{turn_deg:.1f}", f"{closure.probability:.4f}"]
         errors = ["", "", "", ""]
         if judged is not None:
             errors = [f"{judged.translation_error_m:.3f}", f"{judged.rotation_error_deg:.2f}", f"{judged.nees:.3g}"]

@@ -101,10 +101,10 @@ class SelfCheck:
     def sentence(self) -> str:
         """The result in one line."""
         if not self.closures:
-            return "no closures to judge"
+            return "not judged: no closures with odometry"
         share, low, high = self.precision
         counted = f"{len(self.doubted)} of {len(self.closures)} closures doubted"
-        return f"precision {share:.2f} ({low:.2f} to {high:.2f}), {counted}; judged from the run itself, without truth"
+        return f"precision {share:.2f} (95 %: {low:.2f} to {high:.2f}), {counted}; judged from the run itself"
 
     def describe(self, row: int) -> str:
         """Return one line about a closure."""

@@ -128,9 +128,8 @@ def test_camera_info_and_transforms_become_the_calibration(tmp_path: Path, monke
     np.testing.assert_allclose(found.body_T_lidar, lidar, atol=1e-6)
     assert (found.camera.fx, found.camera.width, found.camera.baseline) == (50.0, 64, 0.25)
     assert "TO BE MEASURED" not in (tmp_path / "my_calibration.yaml").read_text()
-    assert (
-        yaml.safe_load((tmp_path / "my_rover.yaml").read_text())["/**"]["ros__parameters"]["topics"]["cloud"] == CLOUD
-    )
+    written = yaml.safe_load((tmp_path / "my_rover.yaml").read_text())["/**"]["ros__parameters"]
+    assert written["topics"]["cloud"] == CLOUD
     line = only_line(umf("inspect", bag, "--write", tmp_path))
     assert line.endswith("my_rover.yaml is there already: nothing was written; move it, or name another folder")
 

@@ -45,6 +45,7 @@ def test_a_moment_is_a_stamp_or_seconds(run: Path) -> None:
 
 def test_what_is_wrong_is_one_line(run: Path, tmp_path: Path) -> None:
     for command in ("why", "judge", "report"):
+        assert only_line(umf(command, "nowhere")) == "there is no run nowhere"
         assert only_line(umf(command, tmp_path)) == f"{tmp_path} holds no finished run: summary.json is missing"
         assert only_line(umf(command, run.parent)).endswith(f"holds runs and is none; did you mean {run}?")
         assert only_line(umf(command, bag := run.parents[1] / "small.mcap")).endswith(f"umf replay {bag} makes one")

@@ -253,6 +253,16 @@ def test_without_its_images_a_set_needs_no_camera(kind: str, tmp_path: Path) -> 
         assert all(frame.left is None for frame in frames)
 
 
+def test_scans_of_one_time_or_minutes_apart_or_missing_are_named(tmp_path: Path) -> None:
+    table = folder(tmp_path) / "times.txt"
+    scans = [line.split()[0] for line in table.read_text().splitlines() if line.startswith("scans")]
+    for apart_s, told in ((100, "scans 100.0 s apart, from which none"), (0, "all messages have the same time")):
+        table.write_text("\n".join(f"{scan} {1000 + apart_s * number}" for number, scan in enumerate(scans)))
+        assert told in umf("inspect", table.parent).out
+    table.write_text("none.bin 1.0")
+    assert "there is no file none.bin" in only_line(umf("inspect", table.parent))
+
+
 def test_the_axes_of_nclt_point_up(tmp_path: Path) -> None:
     """Its car drives north, and its body and scanner are seen upside down."""
     imported("nclt", tmp_path)

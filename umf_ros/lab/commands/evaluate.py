@@ -354,9 +354,7 @@ def _on_sequences(listing: Path, rule: str, weights: Path | None, out: Path) -> 
     results = validate(network, SequenceList(listing).worlds, rule=RULES[rule])
     if not answerable(results):
         raise ConfigError(f"{listing}: no place is visited twice")
-    notes = [
-        f"{listing}: samples with a true match in an earlier pass are asked for it; same place by the rule {rule}."
-    ]
+    notes = [f"{listing}: samples with a true match in an earlier pass are asked for it; same place by rule {rule}."]
     tables = {"Place recognition by the global descriptor": table(results)}
     return finish(EvaluationReport("Evaluation on sequences", notes, means(results), tables), out, console)
 

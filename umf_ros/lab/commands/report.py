@@ -49,7 +49,7 @@ def command(
         recover_run(folder)
         recording = bag or recording_of(folder)
         if recording is None:
-            raise UmfError(f"{folder}: its recording is unknown or was moved; name it after the folder")
+            raise UmfError(f"{folder}: its recording is unknown or was moved: umf report RUN RECORDING")
         opened = open_bag(recording)
     report_run(folder, opened, console, ground_truth)
 
@@ -166,7 +166,8 @@ def _list(console: Console, about: JudgedRun) -> None:
             stages.setdefault(found.gate, []).append(found)
     first_ns, lost = int(about.run.stamps[0]), sum(map(len, stages.values()))
     missed = f"; {len(about.missed)} of them revisits by the truth" if about.covered[0] else ""
-    console.print(f"{lost} of {len(about.run.stamps)} keyframes closed no loop{missed}", highlight=False)
+    told = "found no place of the map" if about.run.settings.localizing else f"closed no loop{missed}"
+    console.print(f"{lost} of {len(about.run.stamps)} keyframes {told}", highlight=False)
     losses_first = sorted(stages.items(), key=lambda one: (one[0] == "gap rules", -len(one[1])))
     for gate, all_found in losses_first:
         moments = [
@@ -242,13 +243,17 @@ def recover_run(folder: Path) -> bool:
             return False
         settings, inputs = load_settings(folder / "config.yaml"), list(file.graph_inputs())
 
+    from umf_ros.bags.reader import open_bag
     from umf_ros.durable_graph import feed
     from umf_ros.pose_graph.backend import PoseGraph
+    from umf_ros.runs.reader import remember_recording
     from umf_ros.runs.writer import RunRecorder, write_summary
 
     recorder = RunRecorder(folder, settings, str(facts.get("weights", "")))
     write_summary(folder, recorder.summary({}) | {"interrupted": True})
     recorder.close()
+    if (bag := Path(str(facts.get("bag") or "nowhere"))).exists():
+        remember_recording(folder, open_bag(bag))
     graph = PoseGraph(settings.pose_graph)
     if feed(graph, inputs):
         graph.resume({})

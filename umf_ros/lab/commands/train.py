@@ -179,7 +179,6 @@ def export(
     model = export_model(located, precision, calibration, report, outputs)
     save_model(model, out)
     weighed = out.with_suffix(".bin") if out.suffix == ".xml" else out
-    sizes = (
-        f"{len(model.inputs)} inputs, {len(model.outputs)} outputs, {weighed.stat().st_size / 1e6:.1f} MB of weights"
-    )
+    size_mb = weighed.stat().st_size / 1e6
+    sizes = f"{len(model.inputs)} inputs, {len(model.outputs)} outputs, {size_mb:.1f} MB of weights"
     Console().print(f"{out}: {sizes}", markup=False, soft_wrap=True)

@@ -249,6 +249,5 @@ def write_plane(path: Path, poses: Array, edges: ArrayLike, ids: Sequence[int] |
     places, steps = (np.column_stack([one[:, :2, 3], heading(one)]) for one in (poses, measured["pose"]))
     lines = g2o_lines("VERTEX_SE2", [(name,) for name in names], places)
     with writing(path):
-        path.write_text(
-            "".join(lines + g2o_lines("EDGE_SE2", pairs, np.hstack([steps, information]))), encoding="utf-8"
-        )
+        edges_told = g2o_lines("EDGE_SE2", pairs, np.hstack([steps, information]))
+        path.write_text("".join(lines + edges_told), encoding="utf-8")

@@ -210,6 +210,9 @@ def _about_odometry(bag: Bag, found: Inspected) -> Iterator[Advice]:
         if found.topics.cloud and found.is_live:
             made = f"loop_closure_node makes it from {found.topics.cloud} (odometry.engine: {ENGINE})"
             yield Advice("note", f"no odometry{also}: {made}")
+        elif found.topics.cloud and (apart_s := _period_s(bag, found)) > found.settings.sync.max_odometry_gap_s:
+            what = f"no odometry{also}, and scans {apart_s:.1f} s apart, from which none can be made"
+            yield Advice("warning", what, "are the stamps in seconds? --odometry FILE.tum gives that of another system")
         elif found.topics.cloud:
             what = f"no odometry{also}: umf replay, umf slam and umf map make it from {found.topics.cloud} (vgicp)"
             yield Advice("note", what, "--odometry FILE.tum takes that of another system")
@@ -217,6 +220,10 @@ def _about_odometry(bag: Bag, found: Inspected) -> Iterator[Advice]:
             remedy = "publish its poses" if found.is_live else "give its poses with --odometry FILE.tum"
             what = f"no odometry: closures only, the pose graph is skipped{also}"
             yield Advice("warning", what, f"run one (Basalt on the images) and {remedy}")
+
+
+def _period_s(bag: Bag, found: Inspected) -> float:
+    return bag.duration_s / max(bag.topics[found.topics.cloud].count - 1, 1)
 
 
 def _stamps(bag: Bag, topics: Collection[str]) -> dict[str, NDArray[np.int64]]:
@@ -259,10 +266,13 @@ def _about_clocks(bag: Bag, found: Inspected) -> Iterator[Advice]:
 
 def _about_gaps(bag: Bag, found: Inspected) -> Iterator[Advice]:
     settings = found.settings
-    if bag.duration_s < settings.loop.min_time_gap_s and not found.is_live:
+    if not bag.duration_s:
+        yield Advice("fault", "all messages have the same time", "record when each was taken")
+    elif bag.duration_s < settings.loop.min_time_gap_s and not found.is_live:
         gap = f"loop.min_time_gap_s, {settings.loop.min_time_gap_s:g} s"
         what = f"{bag.duration_s:.1f} s are shorter than {gap}: no match is allowed"
-        remedy = gap_remedy(bag.duration_s, None if found.topics.odometry else 0.0, settings)
+        has_odometry = found.topics.odometry or found.topics.cloud  # of the scans
+        remedy = gap_remedy(bag.duration_s, None if has_odometry else 0.0, settings)
         yield Advice("fault", what, f"drive longer, or set {remedy}")
 
 

@@ -195,11 +195,8 @@ def save_acceptance(model: AcceptanceModel, path: Path, fitted_with: dict[str, s
         fitted_with: the command that made a part, by the name of the part.
         results: what it reached.
     """
-    before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"fitted_with": {}, "results": {}}
-    content: dict[str, Any] = {
-        "fitted_with": before["fitted_with"] | fitted_with,
-        "results": before["results"] | results,
-    }
+    old = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"fitted_with": {}, "results": {}}
+    content: dict[str, Any] = {"fitted_with": old["fitted_with"] | fitted_with, "results": old["results"] | results}
     content["models"] = {kind: asdict(model.models[kind]) for kind in CRITERIA}
     content["bounds"] = model.bounds
     content["covariance"] = {kind: asdict(model.covariances[kind]) for kind in CRITERIA}

@@ -75,9 +75,8 @@ def sample_of(match: Keyframe, query: Keyframe, alignment: Alignment, true: Arra
     grown = motion_covariance(match, query, alignment, bare)
     walked = motion_covariance(match, query, alignment, replace(bare, motion=1.0)) - grown
     removed = match.motion is not None and query.motion is not None
-    return PoseSample(
-        pose_error(alignment.pose, true), alignment.information, alignment.overlap, walked, grown, removed
-    )
+    error = pose_error(alignment.pose, true)
+    return PoseSample(error, alignment.information, alignment.overlap, walked, grown, removed)
 
 
 def covariances_of(samples: Sequence[PoseSample], model: CovarianceModel) -> Array:

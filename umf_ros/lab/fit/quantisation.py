@@ -160,9 +160,8 @@ def export_model(
         config = None if of_xfeat else read_config(weights)
         frames = rendered_frames(calibration, WORLDS, report)
         inputs = [list(read_frame(frame, config)) if config else image_input(frame) for frame in frames]
-        model = quantise(
-            model, [one for one in inputs if one], XFEAT_NOT_QUANTISED if of_xfeat else NOT_QUANTISED, report
-        )
+        kept = XFEAT_NOT_QUANTISED if of_xfeat else NOT_QUANTISED
+        model = quantise(model, [one for one in inputs if one], kept, report)
     model.set_rt_info(precision, [FACTS, "precision"])
     model.set_rt_info(hashlib.sha256(weights.read_bytes()).hexdigest(), [FACTS, "weights"])
     return model

@@ -184,9 +184,8 @@ def to_geodetic(world: Array) -> Array:
     meridian = _SEMI_MAJOR_M * (1 - _ECCENTRICITY2) / squash**1.5 + ORIGIN[2]
     parallel = (_SEMI_MAJOR_M / np.sqrt(squash) + ORIGIN[2]) * np.cos(latitude)
     east, north, up = np.asarray(world).T
-    return np.stack(
-        [ORIGIN[0] + np.degrees(north / meridian), ORIGIN[1] + np.degrees(east / parallel), ORIGIN[2] + up], 1
-    )
+    latitudes, longitudes = ORIGIN[0] + np.degrees(north / meridian), ORIGIN[1] + np.degrees(east / parallel)
+    return np.stack([latitudes, longitudes, ORIGIN[2] + up], 1)
 
 
 def rtklib_text(track: GnssTrack, start_ns: int, weeks: bool = False, ahead_s: int = GPS_MINUS_UTC_S) -> str:

@@ -214,9 +214,7 @@ class Simulator:
         else:
             stamps = START_NS + (np.arange(0, self.duration_s - 0.3, 1 / rate_hz) * 1e9).astype(np.int64)
         arrived = rng.random(len(stamps)) >= self.preset.layout.right_lost
-        return [
-            Exposure(int(stamp), i, bool(right)) for i, (stamp, right) in enumerate(zip(stamps, arrived, strict=True))
-        ]
+        return [Exposure(int(at), i, bool(right)) for i, (at, right) in enumerate(zip(stamps, arrived, strict=True))]
 
     def _checked(self, duration_s: float | None) -> float:
         longest = self.motion.duration_s

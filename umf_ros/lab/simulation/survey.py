@@ -275,9 +275,8 @@ def _from_above(points: Field) -> Image:
     """The scan in the body frame from above, the rover at the bottom, high in red and low in blue."""
     canvas = np.zeros((_TILE[1], _TILE[0], 3), np.uint8)
     scale = _TILE[1] / _BIRD_REACH_M
-    _dots(
-        canvas, _TILE[0] / 2 - points[:, 1] * scale, _TILE[1] - points[:, 0] * scale, _colours(points[:, 2] / 6 + 0.4)
-    )
+    x, y = _TILE[0] / 2 - points[:, 1] * scale, _TILE[1] - points[:, 0] * scale
+    _dots(canvas, x, y, _colours(points[:, 2] / 6 + 0.4))
     return canvas
 
 

@@ -307,6 +307,5 @@ def _horizon(relief: Relief, rng: np.random.Generator) -> Mesh:
     vertices = np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32)
     triangles = grid_triangles(cells)
     zeros = np.zeros(len(triangles))
-    return Mesh(
-        vertices, triangles, vertex_normals(vertices, triangles), zeros.astype(np.float32), zeros.astype(np.int32)
-    )
+    normals = vertex_normals(vertices, triangles)
+    return Mesh(vertices, triangles, normals, zeros.astype(np.float32), zeros.astype(np.int32))

@@ -133,9 +133,7 @@ class MetricSettings(RunSettings):
     )
     local_pairs: int = Field(4, ge=0, description="pairs of a batch that train local and super-features")
     local_matches: int = Field(192, ge=1, description="correspondences used per pair")
-    modality_dropout: float = Field(
-        0.15, ge=0, le=0.5, description="chance of losing the image, and of losing the scan"
-    )
+    modality_dropout: float = Field(0.15, ge=0, le=0.5, description="chance of losing the image, and the scan")
     looks: float = Field(
         0.5, ge=0, le=1, description="chance that an image is taken by another camera, by night, against the sun ..."
     )

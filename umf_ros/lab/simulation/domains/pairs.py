@@ -197,9 +197,8 @@ def pairs_of(places: list[ScannedPlace], domain: Domain, rng: np.random.Generato
             continue
         away = np.array([_distance(query, match) for match in first])
         turned = np.array([_turn_deg(query, match) for match in first])
-        kind, fits = (
-            (TURNED, turned > OTHER_WAY_DEG) if query.scan.label == OTHER_WAY else (SAME, turned < SAME_WAY_DEG)
-        )
+        is_other = query.scan.label == OTHER_WAY
+        kind, fits = (TURNED, turned > OTHER_WAY_DEG) if is_other else (SAME, turned < SAME_WAY_DEG)
         near = np.flatnonzero(fits & (away < SAME_M * domain.scale))
         if len(near):
             nearest = int(near[away[near].argmin()])

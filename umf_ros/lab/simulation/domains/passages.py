@@ -88,9 +88,8 @@ def aisle(solids: Solids, rng: np.random.Generator, moves: np.random.Generator, 
     hall.shell(solids, rng)
     alike = rng.uniform([0.9, 0.8, 0.7], [1.3, 1.0, 1.2])
     for side in (-1, 1):
-        solids.ribbon(
-            np.array([[-HALF_LENGTH_M, 1.0], [HALF_LENGTH_M, 1.0]]) * [1, side * (width / 2 + 1.2)], 0.0, height
-        )
+        ends = np.array([[-HALF_LENGTH_M, 1.0], [HALF_LENGTH_M, 1.0]]) * [1, side * (width / 2 + 1.2)]
+        solids.ribbon(ends, 0.0, height)
         for z in np.arange(level, height - 0.5, level):
             foot = [0.0, side * (width / 2 + 0.55), z - 0.1]
             solids.box(foot, [2 * HALF_LENGTH_M, 1.1, 0.1], 0.0, 0.5)

@@ -253,9 +253,8 @@ def survey(domain: Domain, seed: int, step_m: float, longest_m: float, place: Pl
         scene, scanner = place.scene(visit), domain.scanner if label == FIRST else domain.query_scanner
         for world_T_body in _drive(place, label, (step_m * domain.scale, longest_m * domain.scale), rng):
             phase, start_s = rng.random(), rng.random()
-            motion = SweepMotion(
-                world_T_body, mount, scanner, (phase, start_s, float(rng.normal(0, 0.15))), body_T_lidar
-            )
+            shaken = phase, start_s, float(rng.normal(0, 0.15))
+            motion = SweepMotion(world_T_body, mount, scanner, shaken, body_T_lidar)
             found = sweep(scanner, scene, motion.world_T_lidar, rng)
             stamp = stamp_moment(scanner)
             lidar = motion.world_T_lidar(stamp)
