@@ -16,6 +16,7 @@ def command(folder: Annotated[Path, typer.Argument(help="A run folder, such as r
     Prints their precision with an interval of 95 %, and the closures it doubts; writes self_check.csv into the folder.
     """
     options.check_run(folder)
+    options.check_mapping(folder)
 
     from rich.console import Console
 

@@ -72,6 +72,15 @@ def check_run(folder: Path) -> None:
         raise UmfError(f"{folder} holds no finished run: summary.json is missing")
 
 
+def check_mapping(folder: Path) -> None:
+    """Check that a run did not localise in a map, where it has no closures between places of its own."""
+    from umf_ros.core.config import load_settings
+
+    if (settings := load_settings(folder / "config.yaml")).localizing:
+        found = "its poses are in trajectory_in_map.tum and localization.csv"
+        raise UmfError(f"{folder} localised in {settings.map}: {found}, and it has no closures of its own places")
+
+
 def parameters(config: Path | None, changes: list[str] | None) -> Parameters:
     """Return the parameters of `--config` and `--set`."""
     from umf_ros.core.config import Parameters, parse_changes

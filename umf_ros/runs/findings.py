@@ -391,10 +391,7 @@ class RunVerdict:
 
 
 def conclude(about: JudgedRun, findings: list[Advice]) -> RunVerdict:
-    """Return the verdict: green only with a closure or a pose in the map, or without any revisit."""
-    if in_map := about.run.summary.get("localization"):
-        found = f"Pose in the map known at {in_map['located']} of {in_map['keyframes']} keyframes."
-        return RunVerdict(found, "good", 0) if in_map["located"] else RunVerdict(found, "bad", USELESS)
+    """Return the verdict: green only with a closure found, or without any revisit."""
     sentence = ", ".join(filter(None, (_found(about), _used(about)))) + _errors(about) + "."
     closed, warnings = bool(about.run.closures), [finding for finding in findings if finding.severity != "note"]
     first = f"{_capital(warnings[0].what)}. " if warnings else ""

@@ -112,8 +112,7 @@ def closure_rows(about: JudgedRun) -> list[list[str]]:
         at_s, back_s = ((closure.query_stamp_ns - other) * 1e-9 for other in (start, closure.match_stamp_ns))
         shift_m, turn_deg = size_of(closure.match_T_query)
         verdict, judged = about.run.verdicts.get(closure.endpoints), about.by_endpoints.get(closure.endpoints)
-        back = "-" if about.run.settings.localizing else f"{back_s:.1f}"  # the clock of the map is another
-        figures = [f"{at_s:.1f}", back, f"{shift_m:.2f}", f"{turn_deg:.1f}", f"{closure.probability:.4f}"]
+        figures = [f"{at_s:.1f}", f"{back_s:.1f}", f"{shift_m:.2f}", f"{turn_deg:.1f}", f"{closure.probability:.4f}"]
         errors = ["", "", "", ""]
         if judged is not None:
             errors = [f"{judged.translation_error_m:.3f}", f"{judged.rotation_error_deg:.2f}", f"{judged.nees:.3g}"]
@@ -135,7 +134,7 @@ def _facts(summary: Summary) -> list[tuple[str, str]]:
         "keyframes": f"{summary['keyframes']}, {summary['queries']} of them with candidates",
         "closures": f"{summary['closures_published']} published, {summary['closures_rejected']} candidates rejected",
     }
-    if truth and not summary.get("localization"):
+    if truth:
         facts["revisits"] = _revisits(truth)
         facts["stated errors"] = _consistency(truth)
     if latency["total"]["p50"] is not None:
@@ -202,7 +201,7 @@ def finish_run(
 
 def _judged_by_itself(run: FinishedRun) -> str | None:
     """Return what the run says of its own closures, and write the table; None of a run without any."""
-    if not run.closures or run.settings.localizing or not (run.folder / NAME).is_file():
+    if not run.closures or not (run.folder / NAME).is_file():
         return None
     found = check_run(run.folder)
     found.write(run.folder / TABLE)

@@ -28,7 +28,6 @@ from scipy.special import expit
 
 from umf_ros.absolute.reference import AbsoluteReference
 from umf_ros.core.config import PoseGraphSettings, load_settings
-from umf_ros.core.errors import UmfError
 from umf_ros.core.frames import LoopClosure
 from umf_ros.core.geometry import Array, cubes, evenly, first_of_cubes, invert, transform
 from umf_ros.core.io import write_table
@@ -127,11 +126,9 @@ def check_run(folder: Path) -> SelfCheck:
     """Judge the closures of a run.
 
     Raises:
-        UmfError: the folder holds no run, one that localised in a map, or a damaged one.
+        UmfError: the folder holds no run, or it is damaged.
     """
-    if (known := load_settings(folder / "config.yaml")).localizing:
-        raise UmfError(f"{folder} localised in {known.map}: it has poses there, and no closures between its own places")
-    settings = known.pose_graph
+    settings = load_settings(folder / "config.yaml").pose_graph
     with closing(RunFile(folder, read_only=True)) as file:
         sessions = Sessions(settings, AbsoluteReference(settings))
         take: Any = lambda *sample: sessions.chains[-1].add(*sample)  # noqa: E731 - into the newest session

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from umf_ros.commands.recordings import TruthPath, check_files, check_run
+from umf_ros.commands.recordings import TruthPath, check_files, check_mapping, check_run
 from umf_ros.core.errors import UmfError, reading
 from umf_ros.lab.commands.inspect import print_table
 
@@ -38,6 +38,7 @@ def command(
     """
     check_files(bag or Path(), ground_truth)
     check_run(folder)
+    check_mapping(folder)
 
     from rich.console import Console
 
