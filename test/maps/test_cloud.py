@@ -100,7 +100,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert done.status == 0, done.err
     summary = json.loads((folder / "map" / "summary.json").read_text())["closures_between"]
-    assert "30 places" in done.out and summary["accepted"] == summary["found"] == 15
+    assert "30 places of a cloud, seen in 2 directions" in done.out and summary["accepted"] == summary["found"] == 15
     return folder / "map"
 
 

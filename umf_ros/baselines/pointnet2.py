@@ -86,9 +86,8 @@ class PointNet2(PlaceNetwork):
         self.near = SetAbstraction(0, (64, 64, 128), 128, 2.5, 16)
         self.far = SetAbstraction(128, (128, 128, 256), 32, 8.0, 16)
         self.whole = SetAbstraction(256, (256, 512), 0, 20.0, 0)
-        self.head = nn.Sequential(
-            nn.Linear(512, 512, bias=False), nn.BatchNorm1d(512), nn.ReLU(), nn.Linear(512, length)
-        )
+        layers = nn.Linear(512, 512, bias=False), nn.BatchNorm1d(512), nn.ReLU(), nn.Linear(512, length)
+        self.head = nn.Sequential(*layers)
 
     def forward(self, batch: PlaceInput) -> dict[str, Tensor]:
         """Descriptor of the points."""

@@ -222,6 +222,7 @@ def import_cloud(
     from umf_ros.detector import make_detector_embedder
     from umf_ros.maps import cloud as clouds
     from umf_ros.maps.map_folder import MapFolder
+    from umf_ros.maps.outputs import sentence
 
     if out.is_dir() and any(out.iterdir()):
         raise ConfigError(f"{out} holds files already: import a cloud into a folder of its own; nothing was written")
@@ -248,7 +249,7 @@ def import_cloud(
             raise UmfError(f"{missing} of {missing + count} views {clouds.BLIND}")
         copytree(target.path, out, dirs_exist_ok=True)
     summary = _solve(MapFolder.open(out), console)
-    console.print(f"{out}: {count} places", **PLAIN)
+    console.print(f"{out}: {sentence(summary)}", **PLAIN)
     if missing:
         console.print(f"{missing} of {missing + count} views {clouds.BLIND}", **WARNING)
     if outside := sum(one["places"] for one in summary["sessions"] if not one["joined"]):

@@ -103,9 +103,8 @@ def _lidar_depths(frame: Frame, pixels: Points) -> Array:
     at, depth = at[seen], depth[seen]
     if len(depth) < NEIGHBOURS:
         return unknown
-    distance, index = cKDTree(at, balanced_tree=False, compact_nodes=False).query(
-        pixels, k=NEIGHBOURS, distance_upper_bound=reach
-    )
+    tree = cKDTree(at, balanced_tree=False, compact_nodes=False)
+    distance, index = tree.query(pixels, k=NEIGHBOURS, distance_upper_bound=reach)
     found = np.isfinite(distance)
     around = np.where(found, depth[np.minimum(index, len(depth) - 1)], np.nan)
     enough = found.sum(axis=1) >= 2

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -192,9 +193,9 @@ def import_cloud(
             assert place.odom_T_body is not None
             step = relative(match_pose, place.odom_T_body)
             between.append(LoopClosure(place.stamp_ns, match_ns, step, _EXACT, 0.999))
-        about = {"path": str(path.resolve()), "start_ns": walked[0].stamp_ns, "end_ns": walked[-1].stamp_ns}
+        about: dict[str, Any] = {"start_ns": walked[0].stamp_ns, "end_ns": walked[-1].stamp_ns, "of_cloud": True}
         drive = Drive(f"{path.stem}_{turn_deg:.0f}", walked, list(places.values()), between)
-        about["messages"] = {drive.name: len(walked)}
+        about |= {"path": str(path.resolve()), "messages": {drive.name: len(walked)}}
         session = add_drive(target, drive, (embedder.name, embedder.dimension), about)
         if not first:
             for row, one in places.items():

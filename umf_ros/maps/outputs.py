@@ -103,12 +103,19 @@ def summarise(joint: JointMap) -> dict[str, Any]:
 
 
 def sentence(summary: dict[str, Any]) -> str:
-    """Return a sentence on joined sessions and closures between them; of a single one, on its own closures."""
+    """Return a sentence on joined sessions and closures between them; on the closures of one, or places of a cloud."""
     within, between = (in_words(summary[f"closures_{where}"]) for where in ("within", "between"))
+    if _is_cloud(summary):
+        count = sum(one["places"] for one in summary["sessions"])
+        return f"{count} places of a cloud, seen in {len(summary['sessions'])} directions"
     if len(summary["sessions"]) == 1:
         return f"one session; its closures: {within}"
     joined = f"{summary['joined']} of {len(summary['sessions'])} sessions"
     return f"{joined} in one frame; closures between them: {between}; within them: {within}"
+
+
+def _is_cloud(summary: dict[str, Any]) -> bool:
+    return {bool(one.get("of_cloud")) for one in summary["sessions"]} == {True}
 
 
 def in_words(counts: dict[str, int]) -> str:
@@ -117,9 +124,9 @@ def in_words(counts: dict[str, int]) -> str:
 
 
 def crispness(summary: dict[str, Any]) -> str:
-    """Return a sentence on the thickness of surfaces; empty where no sessions overlap."""
+    """Return a sentence on the thickness of surfaces; empty where no drives overlap."""
     thickness = summary["thickness_m"]
-    if thickness["after"] is None:
+    if thickness["after"] is None or _is_cloud(summary):
         return ""
     before, after = (f"{100 * thickness[when]:.1f}" for when in ("before", "after"))
     return f"surfaces seen by several sessions are {after} cm thick, by odometry alone {before} cm"
@@ -131,6 +138,7 @@ def _about(joint: JointMap, one: JointSession, ties: int) -> dict[str, Any]:
     return {
         "name": session.name,
         "recording": session.recording["path"],
+        "of_cloud": session.recording.get("of_cloud", False),
         "places": session.places,
         "places_in_map": len(one.stamps),
         "joined": one.joined,

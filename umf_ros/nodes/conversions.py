@@ -26,9 +26,8 @@ from umf_ros.sensors.decode import LAST_STAMP_NS, decode_pose
 
 def latched(depth: int) -> QoSProfile:
     """Return the profile of a topic whose last messages also reach late subscribers (REP-2003)."""
-    return QoSProfile(
-        depth=depth, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
-    )
+    sent, kept = QoSReliabilityPolicy.RELIABLE, QoSDurabilityPolicy.TRANSIENT_LOCAL
+    return QoSProfile(depth=depth, reliability=sent, durability=kept)
 
 
 CLOSURES_QOS = latched(5000)

@@ -299,14 +299,12 @@ class RelativeCovariances:
         # paths are symmetric: trees grow from the side with fewer roots
         (starts, leave), (stops, enter) = sorted(ends, key=lambda one: len(np.unique(one[0])))
         sources, of_source = np.unique(starts, return_inverse=True)
-        found, before = dijkstra(
-            self._paths, directed=False, indices=sources, return_predecessors=True, limit=lengths[rows].max()
-        )
+        most = lengths[rows].max()
+        found, before = dijkstra(self._paths, directed=False, indices=sources, return_predecessors=True, limit=most)
         totals = _length(leave[0]) + found[of_source, stops] + _length(enter[0])
         shorter = np.flatnonzero(totals < lengths[rows])
-        along = propagate(
-            adjoint(invert(poses[shorter]) @ self._poses[:1]), self._along(before[of_source[shorter]], stops[shorter])
-        )
+        steps = self._along(before[of_source[shorter]], stops[shorter])
+        along = propagate(adjoint(invert(poses[shorter]) @ self._poses[:1]), steps)
         covariances[:, rows[shorter]] = leave[:, shorter] + enter[:, shorter] + along
         lengths[rows[shorter]] = totals[shorter]
 

@@ -44,9 +44,8 @@ def common_keypoints(query: Keypoints, match: Keypoints) -> tuple[int, float, Ar
     if len(here) < const.MIN_KEYPOINTS:
         return nothing
     cv2.setRNGSeed(0)
-    motion, inliers = cv2.estimateAffinePartial2D(
-        query[here, :2], match[there, :2], ransacReprojThreshold=2 * const.TERRAIN_CELL_M, maxIters=300
-    )
+    ends, reach_m = (query[here, :2], match[there, :2]), 2 * const.TERRAIN_CELL_M
+    motion, inliers = cv2.estimateAffinePartial2D(*ends, ransacReprojThreshold=reach_m, maxIters=300)
     if motion is None or abs(float(np.hypot(motion[0, 0], motion[1, 0])) - 1) > const.KEYPOINT_SCALE:
         return nothing
     return int(inliers.sum()), math.atan2(motion[1, 0], motion[0, 0]), np.asarray(motion[:, 2], float)
