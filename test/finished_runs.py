@@ -133,7 +133,8 @@ def examined(
     return JudgedRun(
         run,
         closures=judge_closures(closures, *poses),
-        revisits=len(closures) + len(missed or []),
+        revisits=(again := len(closures) + len(missed or [])),
+        any_heading=(again, len(closures)),
         covered=(int(truth.at(run.stamps)[1].sum()), len(rows)),
         missed=[stamp(second) for second in missed or []],
         ate_odometry_m=ate and ate[0],

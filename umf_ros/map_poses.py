@@ -15,7 +15,7 @@ from umf_ros.absolute.measurement import parse_numbers
 from umf_ros.core.config import Settings
 from umf_ros.core.errors import MessageError, UmfError, command_line, one_line
 from umf_ros.core.frames import Keyframe
-from umf_ros.core.geometry import Array, heading, invert, make_pose, relative, rotation_angle
+from umf_ros.core.geometry import Array, heading, invert, make_pose, rotation_angle
 from umf_ros.core.io import write_atomically
 from umf_ros.core.limits import open_archive, read_json
 from umf_ros.core.trajectory import Trajectory
@@ -155,10 +155,8 @@ class PoseHint:
         first = self._first = self._first or keyframe
         pose = self._initial.map_T_body
         if first is not keyframe:
-            if first.odom_T_body is None or keyframe.odom_T_body is None or first.session != keyframe.session:
-                return {}
-            step = relative(first.odom_T_body, keyframe.odom_T_body)
-            if keyframe.path_length_m - first.path_length_m > _REACH_M:
+            step = first.pose_of(keyframe)
+            if step is None or keyframe.path_length_m - first.path_length_m > _REACH_M:
                 return {}
             pose = pose @ step
         reach_m = _NEAR_M + 2 * float(np.sqrt(self._initial.covariance[:2, :2].trace() / 2))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from umf_ros.core.config import EmbeddingSettings, Settings, topics_of
 from umf_ros.core.errors import BagError
 from umf_ros.core.frames import Frame
 from umf_ros.core.trajectory import Trajectory
-from umf_ros.sensors.scan_odometry import ENGINES, FEWEST_POINTS, MAX_LOST, RANGE_M, ScanOdometry
+from umf_ros.sensors.scan_odometry import ENGINES, MAX_LOST, ScanOdometry
 
 OnScan = Callable[[float], None]
 FIRST = 5
@@ -57,10 +57,10 @@ def odometry_of_scans(
     told: list[str] = []
     reader = FrameReader(bag, settings.model_copy(update=alone), warn=told.append)
     scans = _first_session(reader)
-    first = list(islice(scans, FIRST))
-    trial = ScanOdometry(ENGINES[engine]())
-    for frame in first:
-        trial.add(frame)
+    first, trial = list[Frame](), ScanOdometry(ENGINES[engine]())
+    while len(trial.samples) < FIRST and (frame := next(scans, None)) is not None:
+        if trial.add(frame):
+            first.append(frame)
     odometry = ScanOdometry(ENGINES[engine](), trial.twist)
     for frame in chain(first, scans):
         odometry.add(frame)
@@ -73,14 +73,13 @@ def odometry_of_scans(
 
 
 def _first_session(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Yield the frames with points until the clock is set back."""
+    """Yield the frames until the clock is set back."""
     session: int | None = None
     for frame in frames:
         session = frame.session if session is None else session
         if frame.session != session:
             return
-        if frame.points is not None and (np.abs(frame.points) < RANGE_M).all(axis=1).sum() >= FEWEST_POINTS:
-            yield frame
+        yield frame
 
 
 def _check(engine: str, odometry: ScanOdometry, max_gap_s: float) -> None:

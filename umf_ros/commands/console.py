@@ -53,8 +53,8 @@ class LineProgress(Progress):
 
     def __init__(self, console: Console, what: str) -> None:
         columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[found]}")
-        super().__init__(*columns, TimeRemainingColumn(), console=console, transient=True)
-        self.disable = not console.is_terminal  # else it leaves blank lines there
+        quiet = not console.is_terminal  # else it leaves blank lines there
+        super().__init__(*columns, TimeRemainingColumn(), console=console, transient=True, disable=quiet)
         self._task = self.add_task(what, total=1.0, found="")
         self._what, self._told_s = what, time.monotonic()
 

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from umf_ros.commands import recordings as options
-from umf_ros.core.errors import ConfigError, UmfError, command_line
+from umf_ros.core.errors import ConfigError, command_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -92,8 +92,9 @@ def command(
         from umf_ros.maps.map_folder import MapFolder
         from umf_ros.maps.mapping import Opening, find_recordings, match_session, unmatched
 
-        files = options.parameters(config, changes), dataset, embedder, str(weights) if weights else None
-        opening = Opening(*files, chosen.path, chosen.frame, chosen.engine if chosen.is_wanted else "")
+        parameters, engine = options.parameters(config, changes), chosen.engine if chosen.is_wanted else ""
+        network = embedder, str(weights) if weights else None
+        opening = Opening(parameters, dataset, *network, chosen.path, chosen.frame, engine)
         bags = [open_bag(one) for one in find_recordings(recordings)]  # before there is a folder
         for bag in bags:
             opening.check(bag)
@@ -245,12 +246,10 @@ def import_cloud(
     ):
         target = MapFolder.open_or_create(Path(made) / "map", settings)
         count = clouds.import_cloud(target, cloud, views, embedder, progress.advance_to)
-        if (missing := len(poses) * len(headings) - count) > count:
-            raise UmfError(f"{missing} of {missing + count} views {clouds.BLIND}")
         copytree(target.path, out, dirs_exist_ok=True)
     summary = _solve(MapFolder.open(out), console)
     console.print(f"{out}: {sentence(summary)}", **PLAIN)
-    if missing:
+    if missing := len(poses) * len(headings) - count:
         console.print(f"{missing} of {missing + count} views {clouds.BLIND}", **WARNING)
     if outside := sum(one["places"] for one in summary["sessions"] if not one["joined"]):
         console.print(f"{outside} places are not connected with the others: nothing is found there", **WARNING)

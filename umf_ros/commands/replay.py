@@ -72,16 +72,14 @@ def command(
             mode=mode or ("localization" if map_folder else None),
             map=str(map_folder) if map_folder else None,
         )
-        from umf_ros.core.io import check_folder, create_run_folder
         from umf_ros.detector import LoopDetector, make_detector_embedder
-
-        check_folder(out)
 
         # the network is compiled while the rest is imported
         starting = ThreadPoolExecutor(1, "start").submit(make_detector_embedder, settings)
         from umf_ros.bags.frames import FrameReader
         from umf_ros.bags.inputs import absent_inputs, input_counts
         from umf_ros.bags.trajectories import read_ground_truth
+        from umf_ros.core.io import check_folder, create_run_folder
         from umf_ros.core.resources import MADE_ODOMETRY
         from umf_ros.core.watchdog import watching
         from umf_ros.replay import Replay
@@ -90,6 +88,7 @@ def command(
         from umf_ros.runs.run_file import read_odometry_of
         from umf_ros.runs.writer import begin_folder, count_drops, finish_folder, with_places
 
+        check_folder(out)
     _tell_inputs(console, settings)
     warnings: list[str] = []
     warn = partial(_warn, console, warnings)

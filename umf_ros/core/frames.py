@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from umf_ros.core.geometry import Array, invert, transform
+from umf_ros.core.geometry import Array, invert, relative, transform
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float32]
@@ -197,6 +197,12 @@ class Keyframe:
         """Whether a scan or a stereo pair measured depth; two keyframes without it give no metric pose."""
         image = self.embedding.image
         return len(self.points) > 0 or (image is not None and bool(np.isfinite(image.points).any()))
+
+    def pose_of(self, other: Keyframe) -> Array | None:
+        """Return the pose (4, 4) of another keyframe in this one by odometry; None without, and in another session."""
+        if self.session != other.session or self.odom_T_body is None or other.odom_T_body is None:
+            return None
+        return relative(self.odom_T_body, other.odom_T_body)
 
 
 @dataclass(frozen=True, slots=True)

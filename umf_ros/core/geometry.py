@@ -85,6 +85,11 @@ def heading(world_T_body: Array) -> Any:
     return np.arctan2(world_T_body[..., 1, 0], world_T_body[..., 0, 0])
 
 
+def faces_back(pose: Array) -> Any:
+    """Return whether the x axis of a pose, or of each of (..., 4, 4), points to the rear half of the x-y plane."""
+    return np.abs(heading(pose)) > np.pi / 2
+
+
 def wrap_angle(angle: Any) -> Any:
     """Return the angle or array of angles in radians, wrapped to [-pi, pi)."""
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi

@@ -11,7 +11,7 @@ import numpy as np
 
 from umf_ros.core.config import Settings, Verification
 from umf_ros.core.frames import Keyframe, LoopClosure
-from umf_ros.core.geometry import Array, invert, near, relative
+from umf_ros.core.geometry import Array, invert, near
 from umf_ros.fleet.link import Answer, FleetLink
 from umf_ros.submaps.history import SubmapHistory, can_be_merged, submap_around
 from umf_ros.verification import Hypothesis, RejectReason, Verifier
@@ -95,9 +95,9 @@ def _predict(pair: InterRobotPair, query: Keyframe, match: Keyframe) -> tuple[Ar
     """
     steps, path_m = [], 0.0
     for a, b in zip(pair[:2], (query, match), strict=True):
-        if a.session != b.session or a.odom_T_body is None or b.odom_T_body is None:
+        if (step := a.pose_of(b)) is None:
             return np.eye(4), np.inf, np.inf
-        steps.append(relative(a.odom_T_body, b.odom_T_body))
+        steps.append(step)
         path_m += abs(a.path_length_m - b.path_length_m)
     predicted: Array = invert(steps[1]) @ pair[2].match_T_query @ steps[0]
     return predicted, min(float(np.linalg.norm(step[:3, 3])) for step in steps), path_m

@@ -173,9 +173,9 @@ def import_cloud(
     """Add the views of the cloud of a file to a map; return their number; `on_view` takes the share that is done.
 
     Raises:
-        UmfError: nothing is seen from the poses.
+        UmfError: most of them show too little.
     """
-    first, count, tried = dict[int, tuple[int, Array]](), 0, 0
+    first, count, tried, wanted = dict[int, tuple[int, Array]](), 0, 0, len(views.poses) * len(views.headings_deg)
     for turn_deg in views.headings_deg:
         rows = list(range(len(views.poses)))[:: -1 if turn_deg == 180 else 1]
         turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
@@ -183,11 +183,11 @@ def import_cloud(
         places, between = dict[int, Keyframe](), list[LoopClosure]()
         for row, place in _places(views, embedder, walked, dict(zip(stamps, rows, strict=True))):
             tried += 1
-            on_view(tried / (len(views.poses) * len(views.headings_deg)))
+            on_view(tried / wanted)
             if place is not None:
                 places[row] = place
         if not places:
-            raise UmfError(f"{path}: all views {BLIND}")
+            continue
         for row in places.keys() & first.keys():
             (match_ns, match_pose), place = first[row], places[row]
             assert place.odom_T_body is not None
@@ -202,6 +202,8 @@ def import_cloud(
                 assert one.odom_T_body is not None
                 first[row] = one.stamp_ns + session.shift_ns, one.odom_T_body
         count += len(places)
+    if 2 * count < wanted:
+        raise UmfError(f"{path}: {wanted - count} of {wanted} views {BLIND}")
     return count
 
 

@@ -163,9 +163,9 @@ def replay_session(recording: Path, opening: Opening, folder: Path, on_frame: On
 def _odometry(bag: Bag, opening: Opening, settings: Settings, folder: Path) -> Trajectory | None:
     """Return the odometry of a file, or of the scans where the recording has none, which is kept in the run folder."""
     given, made = opening.odometry_of(bag.path, settings), folder / MADE_ODOMETRY
-    if given is not None or not opening.engine_for(bag, settings):
+    if given is not None or not (engine := opening.engine_for(bag, settings)):
         return given
-    found = odometry_of_scans(bag, settings, opening.engine_for(bag, settings), made)
+    found = odometry_of_scans(bag, settings, engine, made)
     write_tum(made, found)
     return found
 

@@ -158,9 +158,8 @@ class VoxelEncoder(nn.Module):
         self.up_fine = nn.Conv3d(middle, fine, 1)
         self.coarse = nn.Conv3d(middle, config.tokens, 1)
         # a voxel's feature: its parent cell's, its own measurements, and its number as a child
-        self.fine = nn.Sequential(
-            nn.Linear(fine + FEATURES + 8, config.local), nn.GELU(), nn.Linear(config.local, config.local)
-        )
+        layers = nn.Linear(fine + FEATURES + 8, config.local), nn.GELU(), nn.Linear(config.local, config.local)
+        self.fine = nn.Sequential(*layers)
 
     def forward(self, grid: Tensor, coarse_index: Tensor, fine_index: Tensor) -> tuple[Tensor, Tensor]:
         """Encode a grid and read it at the occupied voxels.

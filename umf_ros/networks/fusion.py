@@ -54,9 +54,8 @@ class Block(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.norm_keys = nn.LayerNorm(width) if cross else None
         self.attention = Attention(width, heads)
-        self.feedforward = nn.Sequential(
-            nn.LayerNorm(width), nn.Linear(width, feedforward), nn.GELU(), nn.Linear(feedforward, width)
-        )
+        layers = nn.LayerNorm(width), nn.Linear(width, feedforward), nn.GELU(), nn.Linear(feedforward, width)
+        self.feedforward = nn.Sequential(*layers)
 
     def forward(self, tokens: Tensor, keys: Tensor | None = None, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return tokens (B, N, C) after attention to `keys` (B, M, C), or to themselves, and the attention maps."""

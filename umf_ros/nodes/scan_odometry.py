@@ -18,7 +18,7 @@ from umf_ros.nodes.process import Worker
 from umf_ros.sensors.calibration import Calibration
 from umf_ros.sensors.decode import OdometrySample
 from umf_ros.sensors.router import MessageRouter, wanted_inputs
-from umf_ros.sensors.scan_odometry import ENGINES, FEWEST_POINTS, ScanOdometry
+from umf_ros.sensors.scan_odometry import ENGINES, ScanOdometry
 from umf_ros.sensors.synchronizer import Synchronizer
 from umf_ros.sensors.tf import BodyFrames
 
@@ -43,12 +43,11 @@ def start_engine(
     def take(message: Any) -> None:
         router.take(cloud, message)
         for frame in synchronizer.pop():
-            if frame.points is None or len(frame.points) < FEWEST_POINTS:
-                continue
             if frame.session not in running:
                 running.clear()  # the clock was set back
             odometry = running.setdefault(frame.session, ScanOdometry(make()))
-            odometry.add(frame)
+            if not odometry.add(frame):
+                continue
             counts.update({SCANS: 1, LOST: len(odometry.lost_ns)})
             odometry.lost_ns.clear()
             del odometry.samples[:-KEPT]

@@ -397,7 +397,7 @@ def conclude(about: JudgedRun, findings: list[Advice]) -> RunVerdict:
     first = f"{_capital(warnings[0].what)}. " if warnings else ""
     if any(finding.severity == "fault" for finding in warnings):
         return RunVerdict(first + sentence, "bad", 0 if closed else USELESS)
-    if not closed and about.covered[0] and not about.revisits:
+    if not closed and about.covered[0] and not about.any_heading[0]:
         return RunVerdict(f"No place was revisited. {sentence}", "warn" if warnings else "good")
     return RunVerdict(first + sentence, "good" if closed and not warnings else "warn")
 
@@ -407,8 +407,7 @@ def _found(about: JudgedRun) -> str:
         reason = "there is no ground truth" if about.run.truth is None else "no ground truth for this time"
         return f"{len(about.run.closures)} loop closures; {reason} to judge them by"
     true = int(about.closures.is_true.sum())
-    revisits = about.revisits or about.any_heading[0]
-    return f"{true} true and {len(about.closures) - true} false loop closures at {revisits} revisits"
+    return f"{true} true and {len(about.closures) - true} false loop closures at {about.any_heading[0]} revisits"
 
 
 def _used(about: JudgedRun) -> str:

@@ -50,6 +50,10 @@ class OdometryEngine(Protocol):
         """
 
 
+def _in_range(points: Points) -> NDArray[np.bool_]:
+    return np.asarray(np.einsum("ij,ij->i", points, points) < RANGE_M**2)
+
+
 class Vgicp:
     """Distribution-to-distribution registration of small_gicp [Koide et al., ICRA 2021], on one thread."""
 
@@ -60,7 +64,7 @@ class Vgicp:
 
     def register(self, points: Points, step: Array) -> Array:
         """Return the pose (4, 4) of a scan in the frame of the first one, as `OdometryEngine` says."""
-        near = points[np.einsum("ij,ij->i", points, points) < RANGE_M**2]
+        near = points[_in_range(points)]
         thinned = small_gicp.voxelgrid_sampling(near.astype(float), THINNED_M, 1).points()
         if self._odom_T_body is None and len(thinned) > DENSE_POINTS:
             self._most_points, self._voxel_m, self._neighbours = DENSE
@@ -112,9 +116,10 @@ class ScanOdometry:
         self._first_twist = self.twist
         self._span_ns = 0, 0
 
-    def add(self, frame: Frame) -> None:
-        """Register the points of a frame, which are later than those before."""
-        assert frame.points is not None
+    def add(self, frame: Frame) -> bool:
+        """Register the points of a frame, which are later than those before; return whether enough are in range."""
+        if frame.points is None or np.count_nonzero(_in_range(frame.points)) < FEWEST_POINTS:
+            return False
         offsets_ns = np.zeros(1) if frame.offsets_s is None else 1e9 * frame.offsets_s.astype(float)
         middle_ns = frame.stamp_ns + round(float(offsets_ns.mean()))
         after_ns = np.rint(offsets_ns).astype(np.int64) - (middle_ns - frame.stamp_ns)
@@ -123,7 +128,7 @@ class ScanOdometry:
         self._span_ns = start_ns, max(frame.stamp_ns, middle_ns + int(after_ns.max()))
         if not self.samples:
             self.samples.append(OdometrySample(middle_ns, self._engine.register(points, np.eye(4))))
-            return
+            return True
         last = self.samples[-1]
         seconds = (middle_ns - last.stamp_ns) * 1e-9
         step = expmap(self.twist[None] * seconds)[0]
@@ -134,6 +139,7 @@ class ScanOdometry:
         if len(self.samples) == 1:
             self._first_twist = self.twist
         self.samples.append(OdometrySample(middle_ns, odom_T_body))
+        return True
 
     def trajectory(self) -> Trajectory:
         """Return the poses, from the start of the first scan to the end of the last one at the velocities there."""

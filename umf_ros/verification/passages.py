@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from umf_ros.core.geometry import Array, evenly, heading, invert, make_pose, near, relative, transform
+from umf_ros.core.geometry import Array, evenly, faces_back, invert, make_pose, near, relative, transform
 from umf_ros.verification import constants as const
 from umf_ros.verification.prepared_scan import PreparedScan, Surfaces, common_blur, same_rays, submaps
 from umf_ros.verification.scan_alignment import run_gicp
@@ -182,7 +182,7 @@ class Comparison:
         is: the sensor's pattern favours the heading at which it meets itself.
         """
         poses = np.stack([pose, *rivals])
-        turned = np.abs([heading(relative(pose, one)) for one in rivals]) > (np.inf if headed else np.pi / 2)
+        turned = faces_back(relative(pose, poses[1:])) & (not headed)
         told = self.fits(poses).evidence(0)[1:] / np.where(turned, max(needed, const.TURNED_EVIDENCE), needed)
         if (told >= 1.0).all() or not self.points_tell:
             return told

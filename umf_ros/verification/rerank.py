@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Candidate, Keyframe, LocalFeatures
-from umf_ros.core.geometry import Array, align, relative, transform
+from umf_ros.core.geometry import Array, align, transform
 from umf_ros.core.resources import find
 from umf_ros.verification import constants as const
 
@@ -180,6 +180,5 @@ def _explain(
 def _same_place(a: Keyframe, b: Keyframe) -> bool:
     if a.stamp_ns == b.stamp_ns and a.session == b.session:
         return True
-    if a.odom_T_body is None or b.odom_T_body is None or a.session != b.session:
-        return False
-    return bool(np.linalg.norm(relative(a.odom_T_body, b.odom_T_body)[:3, 3]) < const.SAME_PLACE_M)
+    step = a.pose_of(b)
+    return step is not None and bool(np.linalg.norm(step[:3, 3]) < const.SAME_PLACE_M)

@@ -11,7 +11,7 @@ import numpy as np
 
 from umf_ros.core.config import Verification
 from umf_ros.core.frames import Keyframe, LoopClosure
-from umf_ros.core.geometry import Array, heading, relative
+from umf_ros.core.geometry import Array, faces_back, heading, relative
 from umf_ros.verification import constants as const
 from umf_ros.verification.acceptance import WITHOUT_RIVALS, load_acceptance, refuted
 from umf_ros.verification.hypothesis import Hypothesis, RejectReason, known_only, measurements_of, same_pose
@@ -206,7 +206,8 @@ class Verifier:
         for one, found in passages:  # those at another heading are rivals
             rivals = [other.pose for other, _ in passages if other is not one and other.candidate is one.candidate]
             if rivals:
-                one.measurements["lead"] = found.lead_over(rivals, _expected(*one.keyframes) is not None)
+                query, match = one.keyframes
+                one.measurements["lead"] = found.lead_over(rivals, match.pose_of(query) is not None)
         return judged
 
     def _promises(self, one: Hypothesis, least: float) -> bool:
@@ -329,14 +330,7 @@ def _most_probable(judged: list[Hypothesis]) -> dict[int, Hypothesis]:
     return {one.candidate.index: one for one in sorted(judged, key=lambda one: one.probability or 0.0)}
 
 
-def _expected(query: Keyframe, match: Keyframe) -> Array | None:
-    """The pose `match_T_query` that odometry has; None where there is none."""
-    if query.session != match.session or query.odom_T_body is None or match.odom_T_body is None:
-        return None
-    return relative(match.odom_T_body, query.odom_T_body)
-
-
 def _is_turned(pose: Array, query: Keyframe, match: Keyframe) -> bool:
     """Whether a pose `match_T_query` is turned round to what odometry has, or where there is none, to the match."""
-    expected = _expected(query, match)
-    return abs(float(heading(pose if expected is None else relative(expected, pose)))) > np.pi / 2
+    expected = match.pose_of(query)
+    return bool(faces_back(pose if expected is None else relative(expected, pose)))

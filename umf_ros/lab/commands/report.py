@@ -253,8 +253,8 @@ def recover_run(folder: Path) -> bool:
     recorder = RunRecorder(folder, settings, str(facts.get("weights", "")))
     write_summary(folder, recorder.summary({}) | {"interrupted": True})
     recorder.close()
-    if (bag := Path(str(facts.get("bag") or "nowhere"))).exists():
-        remember_recording(folder, open_bag(bag))
+    if (bag := facts.get("bag")) and Path(str(bag)).exists():
+        remember_recording(folder, open_bag(str(bag)))
     graph = PoseGraph(settings.pose_graph)
     if feed(graph, inputs):
         graph.resume({})
